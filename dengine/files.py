@@ -52,9 +52,13 @@ def read_key(path: FilePath, error: type[DengineError]) -> bytes:
         do="dengine export --make-key writes one",
     ):
         secret = Path(path).read_bytes().rstrip(b"\r\n")
-    wanted = f"a key of {MIN_KEY_BYTES} bytes or more in {path}"
-    is_long = len(secret) >= MIN_KEY_BYTES
-    expect(is_long, wanted, len(secret), "use dengine export --make-key", error)
+    expect(
+        len(secret) >= MIN_KEY_BYTES,
+        f"a key of {MIN_KEY_BYTES} bytes or more in {path}",
+        len(secret),
+        "use dengine export --make-key",
+        error,
+    )
     return secret
 
 
@@ -76,18 +80,13 @@ def check_size(size: float, source: object) -> None:
         limit = min(MAX_BYTES, memory // 2) if memory > 0 else MAX_BYTES
     if size > limit:
         raise DataError(
-            f"Expected at most {_size_text(limit)} of arrays in {source}, got {_size_text(size)}; "
-            "split it, or read it where there is more memory."
+            f"Expected at most {limit / 2**20:,.0f} MB of arrays in {source}, got "
+            f"{size / 2**20:,.0f} MB; split it, or read it where there is more memory."
         )
 
 
 def read_errors(
-    source: object,
-    kind: str,
-    package: str = "",
-    extra: str = "",
-    also: tuple[type[Exception], ...] = (),
-    do: str = "",
+    source: object, kind: str, package: str = "", extra: str = ""
 ) -> AbstractContextManager[None]:
     """Return a context manager that raises DataError instead of what a library raises on bad files.
 
@@ -105,20 +104,12 @@ def read_errors(
         DataError, before there is a context manager. "": no package is needed.
     extra : str
         Extra of dengine that installs the package, for that error: `pip install "dengine[extra]"`.
-    also : tuple of type
-        Further exceptions to catch.
-    do : str
-        What the user can do about a bad file, the end of the message.
     """
     if package and find_spec(package) is None:
-        do = f'pip install "dengine[{extra}]"'
-        raise DataError(f"Expected {package} for {kind}, it is not installed: {do}.")
-    return instead(DataError, f"Cannot read {source} as {kind}", *UNREADABLE, *also, do=do)
-
-
-def _size_text(n_bytes: float) -> str:
-    """Return a number of bytes as text: in GB, or in MB if it is less than half a GB."""
-    return f"{n_bytes / 2**30:.1f} GB" if n_bytes >= 2**29 else f"{n_bytes / 2**20:.1f} MB"
+        raise DataError(
+            f'Expected {package} for {kind}, it is not installed: pip install "dengine[{extra}]".'
+        )
+    return instead(DataError, f"Cannot read {source} as {kind}", *UNREADABLE)
 
 
 def read_archive(
@@ -157,8 +148,10 @@ def read_archive(
         head = file.read(len(NUMPY))
         if head == NUMPY:
             raise ValueError("it is a single array")
-        if why := damage_of(head, ZIP, zipfile.is_zipfile(file)):
-            raise ValueError(why)
+        if not head.startswith(ZIP):
+            raise ValueError("it is none" if head else "it is empty")
+        if not zipfile.is_zipfile(file):
+            raise ValueError("the file is cut off")
         file.seek(0)
         archive = np.load(file, allow_pickle=False)
         members = archive.zip.infolist()
@@ -166,18 +159,6 @@ def read_archive(
         wanted = [key for key in sizes if names is None or key in names]
         check_size(sum(sizes[key] for key in wanted), title)
         return {key: np.asarray(archive[key]) for key in wanted}, list(sizes)
-
-
-def damage_of(head: bytes, magic: bytes, is_whole: bool) -> str:
-    """Return why a file is not of the expected kind: another kind, empty or cut off; "" if it is.
-
-    `head` holds its first bytes, and `magic` the bytes with which every file of this kind begins.
-    `is_whole` says whether the caller found the end of the file, too; it counts only if the
-    beginning is right.
-    """
-    if not head.startswith(magic):
-        return "it is none" if head else "it is empty"
-    return "" if is_whole else "the file is cut off"
 
 
 def is_database(path: Path) -> bool:
@@ -312,10 +293,11 @@ def new_folder(path: FilePath) -> Iterator[Path]:
     """
     target = Path(path)
     with _write_errors(target):
-        if target.exists() and (not target.is_dir() or any(target.iterdir())):
-            wanted = "Expected a new or an empty folder"
-            raise OutputError(f"{wanted}, {target} holds something; name another folder.")
         target.mkdir(parents=True, exist_ok=True)
+        if any(target.iterdir()):
+            raise OutputError(
+                f"Expected a new or an empty folder, {target} holds something; name another folder."
+            )
         yield target
 
 

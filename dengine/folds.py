@@ -10,6 +10,8 @@ C++. `traces.TraceGate` computes the content hash and `decision.decider.Decider`
 of audits in TorchScript.
 """
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -61,7 +63,7 @@ def content_hash(X: NDArray[np.floating]) -> FoldArray:
     array of int64, shape (n,)
     """
     X = np.asarray(X, dtype=np.float32)
-    flat = X.reshape(len(X), int(np.prod(X.shape[1:])))
+    flat = X.reshape(len(X), math.prod(X.shape[1:]))
     weights = hash_weights(flat.shape[1])
     hashes = np.empty(len(flat), dtype=np.int64)
     for start in range(0, len(flat), BLOCK_SIZE):
@@ -90,8 +92,8 @@ def trace_hash(content: int, part: str | None) -> int:
     return content if part is None else part_hash(part)
 
 
-def toss(hashes: FoldArray, salt: int = 0) -> FoldArray:
-    """Return a pseudo-random integer from 0 to 2**30 - 1 for each hash, int64 of shape (n,).
+def toss(hashes: FoldArray | int, salt: int = 0) -> FoldArray:
+    """Return a pseudo-random integer from 0 to 2**30 - 1 for each hash, int64, in their shape.
 
     It is a fixed function of the hash and the salt, an integer that makes another sequence: the
     same arguments give the same integers.
@@ -103,8 +105,8 @@ def toss(hashes: FoldArray, salt: int = 0) -> FoldArray:
         return (h >> (63 - COIN_BITS)) & np.int64(2**COIN_BITS - 1)
 
 
-def fold_of(hashes: FoldArray, folds: int) -> FoldArray:
-    """Return the fold of each hash, 0 .. folds - 1, shape (n,)."""
+def fold_of(hashes: FoldArray | int, folds: int) -> FoldArray:
+    """Return the fold of each hash, 0 .. folds - 1, in the shape of the hashes."""
     return toss(hashes) % folds
 
 

@@ -2,7 +2,7 @@
 `Policy` and `make_reducer` call `import_class`.
 """
 
-from importlib import import_module
+from pkgutil import resolve_name
 
 from .errors import SettingError, instead, shortened
 
@@ -18,14 +18,14 @@ def import_class(path: str) -> type:
         If the module cannot be imported, whatever subclass of Exception it raises, or has no class
         of that name. A SettingError that the module raises passes unchanged.
     """
-    module, _, name = path.partition(":")
     with instead(
         SettingError,
         f"Expected module:Class that can be imported here, got {shortened(path)}",
         Exception,
     ):
-        value = getattr(import_module(module), name)
+        value = resolve_name(path)
     if not isinstance(value, type):
-        kind = type(value).__name__
-        raise SettingError(f"Expected module:Class, {shortened(path)} is a {kind} and no class.")
+        raise SettingError(
+            f"Expected module:Class, {shortened(path)} is a {type(value).__name__} and no class."
+        )
     return value

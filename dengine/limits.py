@@ -12,7 +12,7 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
-from .errors import SettingError, expect, shortened
+from .errors import SettingError, expect, instead, shortened
 from .records import MOST, is_name, is_number, is_whole
 
 
@@ -56,13 +56,14 @@ class ForceLimits:
 
     def __post_init__(self) -> None:
         numbers = (self.start, self.end, self.low, self.high)
-        valid = all(map(is_number, numbers)) and isinstance(self.reject, bool)
-        valid = valid and -math.inf < self.start <= self.end < math.inf
-        valid = valid and self.low <= self.high and (self.low, self.high) != (-math.inf, math.inf)
-        valid = valid and _is_channel(self.channel)
-        valid = valid and (self.along is None or _is_channel(self.along))
         expect(
-            valid,
+            all(map(is_number, numbers))
+            and isinstance(self.reject, bool)
+            and -math.inf < self.start <= self.end < math.inf
+            and self.low <= self.high
+            and (self.low, self.high) != (-math.inf, math.inf)
+            and _is_channel(self.channel)
+            and (self.along is None or _is_channel(self.along)),
             "force_limits with start <= end, low <= high, one of these finite, and channels from 0 "
             "on, or names",
             self,
@@ -92,20 +93,20 @@ class ForceLimits:
         """
         fields = text.split(":")
         options: dict[str, Any] = {}
-        try:
+        with instead(
+            SettingError,
+            "Expected force_limits as START:END:LOW:HIGH, 0.2:0.4::60, with :channel=1, :along=2, "
+            f":reject behind it, got {shortened(text)}",
+            TypeError,
+            ValueError,
+        ):
             start, end, low, high = fields[:4]
             for field in fields[4:]:
                 name, _, value = field.partition("=")
                 options[name] = int(value) if value.isdecimal() else value or True
-            limits = float(low or "-inf"), float(high or "inf")
-            return cls(float(start), float(end), *limits, **options)
-        except SettingError:
-            raise
-        except (TypeError, ValueError) as error:
-            raise SettingError(
-                "Expected force_limits as START:END:LOW:HIGH, 0.2:0.4::60, with :channel=1, "
-                f":along=2, :reject behind it, got {shortened(text)}."
-            ) from error
+            return cls(
+                float(start), float(end), float(low or "-inf"), float(high or "inf"), **options
+            )
 
 
 def _is_channel(value: Any) -> bool:

@@ -14,6 +14,7 @@ import re
 import tomllib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
+from functools import partial
 from inspect import signature
 from pathlib import Path
 from typing import Any
@@ -37,6 +38,7 @@ LARGEST = 2**20  # bytes of a recipe's file
 # better than one at each retrain.
 INTEGER_RANGES = {
     "folds": (2, 1000),
+    "retrain_every": (1, 10**9),
     "max_steps": (0, 10**9),
     "window": (10, 10**8),
 }
@@ -46,19 +48,16 @@ OBJECT_PREFIX = "object "  # before the class name of a reducer that TOML cannot
 class ReducerDefault:
     """Descriptor of a field of `Recipe` whose default is an attribute of the reducer's class.
 
-    Where the field is None, reading it gives the class's value. The class is imported only then,
-    so that naming a reducer imports nothing.
+    Where the field `radius` is None, reading it gives the `default_radius` of the class, see
+    `Reducer`. The class is imported only then, so that naming a reducer imports nothing.
 
     Parameters
     ----------
-    name : str
-        Attribute of the reducer's class, such as `default_radius`; see `Reducer`.
     check : callable
         Raises SettingError for a value out of range.
     """
 
-    def __init__(self, name: str, check: Callable[[Any], None]) -> None:
-        self.name = name
+    def __init__(self, check: Callable[[Any], None]) -> None:
         self.check = check
 
     def __set_name__(self, owner: type, field_name: str) -> None:
@@ -69,7 +68,7 @@ class ReducerDefault:
             return None  # the default, as `dataclass` reads it
         value = vars(recipe)[self.field_name]
         if value is None:
-            value = class_default(recipe.reducer, self.name)
+            value = class_default(recipe.reducer, f"default_{self.field_name}")
             self.check(value)
         return value
 
@@ -79,13 +78,14 @@ class ReducerDefault:
         vars(recipe)[self.field_name] = value
 
 
-def _check_retrain_every(value: Any) -> None:
-    """Raise SettingError for a `retrain_every` that is no integer from 1 to 1,000,000,000."""
+def _check_integer(name: str, value: Any) -> None:
+    """Raise SettingError for a value that the integer setting `name` of a recipe cannot have."""
+    least, most = INTEGER_RANGES[name]
     expect(
-        is_whole(value, 1, 10**9),
-        "retrain_every to be an integer of at least 1",
+        is_whole(value, least, most),
+        f"{name} to be an integer of at least {least}",
         value,
-        "at most 1,000,000,000",
+        f"at most {most:,}",
     )
 
 
@@ -131,10 +131,10 @@ class Recipe:
     params: Params = field(default_factory=dict)
     policy: Policy = field(default_factory=Policy)
     # The descriptor gives a value of this type when it is read.
-    radius: float = ReducerDefault("default_radius", check_radius)  # type: ignore[assignment]
+    radius: float = ReducerDefault(check_radius)  # type: ignore[assignment]
     folds: int = 5
     retrain_every: int = ReducerDefault(  # type: ignore[assignment]
-        "default_retrain_every", _check_retrain_every
+        partial(_check_integer, "retrain_every")
     )
     budget: float = 0.45
     max_steps: int | None = None
@@ -142,25 +142,33 @@ class Recipe:
     novelty: float = NOVELTY
 
     def __post_init__(self) -> None:
-        for name, (least, most) in INTEGER_RANGES.items():
-            value = getattr(self, name)
-            valid = is_whole(value, least, most) or (name == "max_steps" and value is None)
-            expect(
-                valid, f"{name} to be an integer of at least {least}", value, f"at most {most:,}"
-            )
+        _check_integer("folds", self.folds)
+        _check_integer("window", self.window)
+        if self.max_steps is not None:
+            _check_integer("max_steps", self.max_steps)
         expect(is_number(self.budget) and self.budget > 0.0, "budget > 0 seconds", self.budget)
-        valid = is_number(self.novelty) and 0.0 <= self.novelty < float("inf")
-        expect(valid, "a finite novelty of 0 or more", self.novelty, "0 turns it off")
-        is_table = isinstance(self.params, Mapping)
-        expect(is_table, "params to be a table of the reducer's settings", self.params)
-        for name, value in self.params.items():
-            valid = value is None or isinstance(value, PLAIN)
-            valid = valid and BARE_KEY.fullmatch(str(name)) is not None
-            expect(valid, "params of plain names and values", {name: value}, "hand an object in")
-        methods = ("fit", "get_params")
-        valid = isinstance(self.reducer, str) or all(hasattr(self.reducer, m) for m in methods)
         expect(
-            valid,
+            is_number(self.novelty) and 0.0 <= self.novelty < float("inf"),
+            "a finite novelty of 0 or more",
+            self.novelty,
+            "0 turns it off",
+        )
+        expect(
+            isinstance(self.params, Mapping),
+            "params to be a table of the reducer's settings",
+            self.params,
+        )
+        for name, value in self.params.items():
+            is_plain = value is None or isinstance(value, PLAIN)
+            expect(
+                is_plain and BARE_KEY.fullmatch(str(name)) is not None,
+                "params of plain names and values",
+                {name: value},
+                "hand an object in",
+            )
+        expect(
+            isinstance(self.reducer, str)
+            or (hasattr(self.reducer, "fit") and hasattr(self.reducer, "get_params")),
             "a reducer's name, or a scikit-learn transformer with fit and get_params",
             self.reducer,
         )
@@ -177,8 +185,11 @@ class Recipe:
 
         A reducer that is an object is named if `to_toml` writes it as `module:Class`.
         """
-        names = (_name_and_params(self.reducer, self.params)[0], self.policy.guarantee)
-        return [name for name in names if ":" in name and not name.startswith("dengine.reducers.")]
+        return [
+            name
+            for name in (_name_and_params(self.reducer, self.params)[0], self.policy.guarantee)
+            if ":" in name and not name.startswith("dengine.reducers.")
+        ]
 
     @classmethod
     def load(cls, recipe: Any) -> Recipe:
@@ -201,19 +212,23 @@ class Recipe:
         if isinstance(recipe, Recipe):
             return recipe
         if not isinstance(recipe, str | os.PathLike):
-            fits = callable(getattr(recipe, "fit", None)) and not isinstance(recipe, type)
-            expect(fits, "a recipe, its name, or a scikit-learn transformer", recipe)
+            expect(
+                callable(getattr(recipe, "fit", None)) and not isinstance(recipe, type),
+                "a recipe, its name, or a scikit-learn transformer",
+                recipe,
+            )
             return cls(recipe)
-        if str(recipe) in RECIPES:
-            return RECIPES[str(recipe)]
-        text = _read_text(Path(recipe))
+        name = str(recipe)
+        if name in RECIPES:
+            return RECIPES[name]
+        text = _read_text(Path(name))
         if text is not None:
-            return cls.from_toml(text, where=str(recipe))
-        if CLASS_PATH.fullmatch(str(recipe)):
-            return cls(str(recipe))
+            return cls.from_toml(text, where=name)
+        if CLASS_PATH.fullmatch(name):
+            return cls(name)
         raise SettingError(
             f"Expected a recipe among {', '.join(RECIPES)}, a TOML file, or module:Class of a "
-            f"reducer; {str(recipe)[:200]} is none."
+            f"reducer; {name[:200]} is none."
         )
 
     @classmethod
@@ -230,11 +245,7 @@ class Recipe:
         with instead(SettingError, f"{where} is not TOML", ValueError, RecursionError):
             table = tomllib.loads(text)
         _check_keys(table, cls, where)
-        reducer = table.get("reducer", "conv")
         policy = table.pop("policy", {})
-        expect(
-            isinstance(reducer, str), f"in {where} reducer to be a name, or module:Class", reducer
-        )
         expect(isinstance(policy, Mapping), f"in {where} policy to be a table, [policy]", policy)
         policy = {"force_limits" if name == OLD_NAME else name: policy[name] for name in policy}
         _check_keys(policy, Policy, f"{where}, policy,")
@@ -281,7 +292,7 @@ class Recipe:
         plain["reducer"], params = _name_and_params(self.reducer, self.params)
         del plain["params"], plain["policy"]
         policy = {f.name: getattr(self.policy, f.name) for f in fields(self.policy)}
-        tables = {"": plain, "policy": policy, "params": dict(params)}
+        tables = {"": plain, "policy": policy, "params": params}
         # An empty [params] is written too: left out, it would mean those of the reducer's recipe.
         return "\n".join(_table_text(name, values) for name, values in tables.items())
 
@@ -328,7 +339,7 @@ def _check_keys(table: Table, record_type: Any, where: str) -> None:
     `record_type` is the dataclass. The message begins with `where` and lists the fields.
     """
     names = sorted(f.name for f in fields(record_type))
-    unknown = sorted(set(table) - set(names))
+    unknown = sorted(table.keys() - names)
     if unknown:
         raise SettingError(
             f"{where} has an unknown key {listed(unknown)}; known are {', '.join(names)}."
@@ -340,10 +351,11 @@ def _read_text(path: Path) -> str | None:
 
     Raises SettingError if the file is larger than 1 MB, is not UTF-8 or cannot be read.
     """
-    problem = f"{path} is not UTF-8 text"
     with (  # an OSError among them is a name that is too long
         instead(SettingError, f"Cannot read the recipe {str(path)[:200]}", OSError),
-        instead(SettingError, problem, UnicodeDecodeError, do="save it as UTF-8"),
+        instead(
+            SettingError, f"{path} is not UTF-8 text", UnicodeDecodeError, do="save it as UTF-8"
+        ),
     ):
         if not path.is_file():
             return None
@@ -383,12 +395,11 @@ def describe_estimator(estimator: Any) -> str:
     If a value is no boolean, number, text or None, only its class is named, so that the text is the
     same in every process.
     """
-    params = estimator.get_params(deep=True)
     values = (
         f"{name}={value!r}"
         if isinstance(value, PLAIN) or value is None
         else f"{name}: {type(value).__qualname__}"
-        for name, value in sorted(params.items())
+        for name, value in sorted(estimator.get_params(deep=True).items())
     )
     return f"{type(estimator).__qualname__}({', '.join(values)})"
 
@@ -403,9 +414,10 @@ def _table_text(name: str, values: Table) -> str:
 
     None becomes "none".
     """
-    header = f"[{name}]\n" if name else ""
-    texts = {key: toml_value("none" if value is None else value) for key, value in values.items()}
-    return header + "".join(f"{key} = {text}\n" for key, text in texts.items())
+    lines = [f"[{name}]\n"] if name else []
+    for key, value in values.items():
+        lines.append(f"{key} = {toml_value('none' if value is None else value)}\n")
+    return "".join(lines)
 
 
 RECIPES: dict[str, Recipe] = {

@@ -28,8 +28,9 @@ Arrays = Mapping[str, NDArray[Any]]  # the same, only read
 
 def is_whole(value: Any, least: int, most: int) -> bool:
     """Return whether a value is an integer, Python's or NumPy's, from `least` to `most`."""
-    is_integer = isinstance(value, Integral) and not isinstance(value, bool)
-    return is_integer and least <= int(value) <= most
+    if not isinstance(value, Integral) or isinstance(value, bool):
+        return False
+    return least <= int(value) <= most
 
 
 def is_number(value: Any) -> bool:
@@ -158,26 +159,41 @@ class TraceSpec:
             columns = (self.columns,) if isinstance(self.columns, str) else tuple(self.columns)
         object.__setattr__(self, "columns", columns)
         rate = self.rate_hz
-        rated = rate is None or (is_number(rate) and 0 < rate < float("inf"))
-        valid = is_whole(self.samples, 1, MOST) and is_whole(self.channels, 1, MOST) and rated
-        shape = (self.samples, self.channels, self.rate_hz)
-        expect(valid, "a trace of at least 1 sample and 1 channel at a rate above 0 Hz", shape)
+        expect(
+            is_whole(self.samples, 1, MOST)
+            and is_whole(self.channels, 1, MOST)
+            and (rate is None or (is_number(rate) and 0 < rate < float("inf"))),
+            "a trace of at least 1 sample and 1 channel at a rate above 0 Hz",
+            (self.samples, self.channels, rate),
+        )
         unit: Any = "" if self.unit is None else self.unit
         several = isinstance(unit, tuple | list)
         units: Any = tuple(unit) if several else (unit,)
-        texts = all(isinstance(text, str) for text in (*units, *self.columns))
-        expect(texts, "unit and columns of text", (self.unit, self.columns))
-        one_each = not several or len(units) == self.channels
-        expect(one_each, f"{self.channels} units, one a channel", self.unit)
+        expect(
+            all(isinstance(text, str) for text in (*units, *columns)),
+            "unit and columns of text",
+            (self.unit, columns),
+        )
+        expect(
+            not several or len(units) == self.channels,
+            f"{self.channels} units, one a channel",
+            self.unit,
+        )
         units = tuple(text.strip() for text in (units if several else units[0].split(",")))
         if len(units) == self.channels or units == ("",):
             unit = units if len(set(units)) > 1 else units[0] or None
             object.__setattr__(self, "unit", unit)
-        limited = self.limit is None or (is_number(self.limit) and self.limit > 0)
-        expect(limited, "a limit above 0 in the trace's unit, or None", self.limit)
+        expect(
+            self.limit is None or (is_number(self.limit) and self.limit > 0),
+            "a limit above 0 in the trace's unit, or None",
+            self.limit,
+        )
         expect(self.fit in FITS, f"fit to be one of {', '.join(FITS)}", self.fit)
-        different = not self.columns or len(set(self.columns)) == self.channels
-        expect(different, f"{self.channels} different columns, one a channel", self.columns)
+        expect(
+            not columns or len(set(columns)) == self.channels,
+            f"{self.channels} different columns, one a channel",
+            columns,
+        )
 
     @property
     def units(self) -> tuple[str, ...]:
@@ -399,16 +415,16 @@ def as_outcome(value: Any, owner: str = "") -> Outcome:
         return Outcome(value)
 
 
-def source_of(action: Action, audit: bool, success: bool) -> Source:
-    """Return the source of a label, from the action of its decision and the label itself.
+def source_of(decision: Decision, success: bool) -> Source:
+    """Return the source of a label, from its decision and the label itself.
 
-    INSPECTION after a reject. After a verification it is AUDIT if the part was audited (`audit`),
-    else VERIFICATION; after an accept CONFIRMED if the part is good (`success`), else STOP.
+    INSPECTION after a reject. After a verification it is AUDIT if the part was audited, else
+    VERIFICATION; after an accept CONFIRMED if the part is good (`success`), else STOP.
     """
-    if action is Action.REJECT:
+    if decision.action is Action.REJECT:
         return Source.INSPECTION
-    if action is Action.VERIFY:
-        return Source.AUDIT if audit else Source.VERIFICATION
+    if decision.action is Action.VERIFY:
+        return Source.AUDIT if decision.audit else Source.VERIFICATION
     return Source.CONFIRMED if success else Source.STOP
 
 

@@ -22,7 +22,7 @@ def to_jsonable(value: Any) -> Any:
         return value if math.isfinite(value) else None
     if isinstance(value, str):
         return without_password(value)
-    if isinstance(value, bool | int) or value is None:
+    if isinstance(value, int) or value is None:
         return value
     if isinstance(value, list | tuple):
         return [to_jsonable(item) for item in value]

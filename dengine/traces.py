@@ -50,12 +50,7 @@ def as_trace(trace: Any, trace_spec: TraceSpec | None) -> TraceArray:
         For a trace of another shape, and for values that are no real numbers. NaN and infinities
         pass; `TraceGate` finds them.
     """
-    x = _as_real(trace)
-    x = x[None, :] if x.ndim == 1 else x
-    if x.ndim != 2 or x.size == 0:
-        raise TraceError(
-            f"Expected one trace, (samples,) or (channels, samples), got shape {np.shape(trace)}."
-        )
+    x = _with_channels(trace, 2, "one trace, (samples,) or (channels, samples)")
     if trace_spec is not None:
         x = _match_spec(x, trace_spec)
     elif len(x) > x.shape[1]:
@@ -89,12 +84,7 @@ def as_traces(X: ArrayLike, trace_spec: TraceSpec | None = None) -> TraceArray:
     TraceError
         For another shape, or values that are no real numbers. NaN and infinities pass.
     """
-    x = _as_real(X)
-    x = x[:, None, :] if x.ndim == 2 else x
-    if x.ndim != 3 or 0 in x.shape[1:]:
-        raise TraceError(
-            f"Expected traces (n, samples) or (n, channels, samples), got shape {np.shape(X)}."
-        )
+    x = _with_channels(X, 3, "traces (n, samples) or (n, channels, samples)")
     if trace_spec is not None:
         x = _match_spec(x, trace_spec)
     return np.ascontiguousarray(x)
@@ -178,6 +168,21 @@ def _as_real(values: ArrayLike) -> TraceArray:
         return array.astype(np.float32, copy=False)
 
 
+def _with_channels(values: ArrayLike, ndim: int, wanted: str) -> TraceArray:
+    """Convert values to float32 as `_as_real` does, with an axis of channels before the samples.
+
+    The result has `ndim` axes; if only the axis of channels is missing, there is one channel.
+    Raises TraceError, which expects `wanted`, for another number of axes, and for no channel or
+    sample.
+    """
+    x = _as_real(values)
+    if x.ndim == ndim - 1:
+        x = np.expand_dims(x, -2)
+    if x.ndim != ndim or 0 in x.shape[-2:]:
+        raise TraceError(f"Expected {wanted}, got shape {np.shape(values)}.")
+    return x
+
+
 def _match_spec(x: TraceArray, trace_spec: TraceSpec) -> TraceArray:
     """Return traces (..., C, T) fitted to the number of samples of a `TraceSpec`.
 
@@ -243,16 +248,15 @@ class TraceGate(nn.Module):
 
     Parameters
     ----------
-    trace_spec : TraceSpec
-        Shape of the traces, and the sensor's range, `trace_spec.limit`.
+    size : int
+        Number of samples of a trace, all channels together.
     """
 
     quantum: Tensor
     weights: Tensor
 
-    def __init__(self, trace_spec: TraceSpec) -> None:
+    def __init__(self, size: int) -> None:
         super().__init__()
-        self.limit = float("inf") if trace_spec.limit is None else float(trace_spec.limit)
         self.clamp = float(CLAMP)
         self.not_finite = NOT_FINITE
         self.constant = CONSTANT
@@ -261,34 +265,16 @@ class TraceGate(nn.Module):
         self.largest = LARGEST
         # A buffer, for a plain number would become a tensor at each product.
         self.register_buffer("quantum", torch.tensor(QUANTUM))
-        weights = hash_weights(trace_spec.channels * trace_spec.samples)
-        self.register_buffer("weights", torch.from_numpy(weights))
+        self.register_buffer("weights", torch.from_numpy(hash_weights(size)))
 
-    def forward(self, x: Tensor) -> tuple[int, int]:
-        """Check a trace.
-
-        Parameters
-        ----------
-        x : Tensor of float32, shape (C, T)
-
-        Returns
-        -------
-        reason : int
-            Position in `REASONS` of the first fault found (see `check`); 0 if there is none.
-        content_hash : int
-            As `folds.content_hash`; also of a faulty trace.
-        """
-        return self.check(x, self.limit)
-
-    @torch.jit.export
-    def check(self, x: Tensor, limit: float) -> tuple[int, int]:
+    def forward(self, x: Tensor, limit: float = float("inf")) -> tuple[int, int]:
         """Find the first fault of a trace, with `limit` as the sensor's range, and its hash.
 
         Parameters
         ----------
         x : Tensor of float32, shape (C, T)
         limit : float
-            Used in place of `trace_spec.limit`; infinity: no range is checked.
+            Range of the sensor, as `TraceSpec.limit`; infinity: no range is checked.
 
         Returns
         -------
@@ -382,10 +368,8 @@ class ForceLimitsGate(nn.Module):
         limits = [(item.start, item.end, item.low, item.high) for item in force_limits]
         channels = [(rows[item.channel], rows[item.along]) for item in force_limits]
         action = [ActionCode.REJECT if item.reject else ActionCode.VERIFY for item in force_limits]
-        limits_tensor = torch.tensor(limits, dtype=torch.float32).reshape(-1, 4, 1)
-        self.register_buffer("limits", limits_tensor)
-        channels_tensor = torch.tensor(channels, dtype=torch.int64).reshape(-1, 2)
-        self.register_buffer("channels", channels_tensor)
+        self.register_buffer("limits", torch.tensor(limits, dtype=torch.float32).reshape(-1, 4, 1))
+        self.register_buffer("channels", torch.tensor(channels, dtype=torch.int64).reshape(-1, 2))
         self.register_buffer("action", torch.tensor(action, dtype=torch.int64))
         self.register_buffer("time", time)  # (1, T)
 
@@ -438,5 +422,5 @@ def infer_trace_spec(x: TraceArray) -> tuple[TraceSpec, bool]:
             f"or start with DataEngine(trace=TraceSpec(samples={trace_spec.samples}, "
             f"channels={trace_spec.channels})) if it is meant."
         )
-    reason, _ = TraceGate(trace_spec)(torch.from_numpy(x))
+    reason, _ = TraceGate(x.size)(torch.from_numpy(x))
     return trace_spec, reason == 0

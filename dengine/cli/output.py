@@ -89,8 +89,7 @@ class Out:
     force: bool = False
 
     def write(self, contents: Mapping[str, Any]) -> list[Path]:
-        """Write files into the folder `path`, which is created if it is missing; return their
-        paths.
+        """Write files into the folder `path`, which is made if it is missing; return their paths.
 
         Parameters
         ----------
@@ -113,12 +112,14 @@ class Out:
         from ..experiments.figures import save
         from ..experiments.tables import write_csv
 
-        return [
-            save(content, self.path / name, force=self.force)
-            if isinstance(content, Figure)
-            else write_csv(content, self.path / name, self.force)
-            for name, content in contents.items()
-        ]
+        paths = []
+        for name, content in contents.items():
+            path = self.path / name
+            if isinstance(content, Figure):
+                paths.append(save(content, path, force=self.force))
+            else:
+                paths.append(write_csv(content, path, self.force))
+        return paths
 
 
 def print_result(

@@ -241,7 +241,8 @@ def import_parts(
     StoreError
         If the store cannot be read or written.
     """
-    gate = TraceGate(trace_spec)
+    gate = TraceGate(trace_spec.channels * trace_spec.samples)
+    limit = trace_spec.limit or math.inf
     counts: dict[str, Any] = dict.fromkeys(
         ("imported", "quarantined", "repeated", "contradicted"), 0
     )
@@ -260,7 +261,8 @@ def import_parts(
                 continue
             stored = earlier
             if stored is None:
-                stored = _as_stored(decision, trace, gate, policy, store.clock())
+                checked = gate(torch.from_numpy(trace), limit)
+                stored = _as_stored(decision, trace, checked, policy, store.clock())
                 new[decision.id] = stored
             if counts_unreported and decision.action is Action.ACCEPT:
                 # A decision that was stored without a label was counted as unreported.
@@ -268,7 +270,7 @@ def import_parts(
             if label is not None:
                 n_since = n_unreported * (not stored.quarantined)
                 n_unreported -= n_since
-                source = source_of(decision.action, decision.audit, label)
+                source = source_of(decision, label)
                 about = (store.clock(), stored.content_hash, stored.time)
                 labels[decision.id] = NewLabel(decision.id, label, source, 0, None, n_since, *about)
                 counts["quarantined" if stored.quarantined else "imported"] += 1
@@ -292,16 +294,16 @@ def _count_unreported(store: "SqlStore", policy: Policy) -> int:
 
 
 def _as_stored(
-    decision: Decision, trace: TraceArray, gate: TraceGate, policy: Policy, time: float
+    decision: Decision, trace: TraceArray, checked: tuple[int, int], policy: Policy, time: float
 ) -> StoredDecision:
     """Return a record of a decision and a copy of its trace (C, T), without storing it.
 
     Its propensity, the probability of a check, is the policy's audit rate (1 in shadow mode) if the
-    model was certain, else 1. If `gate` finds a fault in the trace, this becomes the reason of the
-    decision, whose propensity stays, and the record is marked as quarantined. `time` is that of the
-    decision, seconds since 1970.
+    model was certain, else 1. `checked` is what a `TraceGate` returned for the trace. If it found a
+    fault, this becomes the reason of the decision, whose propensity stays, and the record is marked
+    as quarantined. `time` is that of the decision, seconds since 1970.
     """
-    fault, content = gate(torch.from_numpy(trace))
+    fault, content = checked
     is_certain = decision.predicted is not Action.VERIFY
     propensity = policy.audited_share if is_certain else 1.0
     reason = REASONS[fault] if fault else decision.reason

@@ -114,22 +114,6 @@ def as_trigger(value: Any) -> Trigger:
     return replace(default, number=stated, signal=signal or default.signal)
 
 
-class Placed(NamedTuple):
-    """Samples of a stream, put into a trace.
-
-    trace : array of float32, shape (C, T)
-        NaN at a place for which no sample came.
-    missing : array of int64, shape (m,)
-        These places, increasing.
-    repeated : int
-        Number of samples that were left out because an earlier sample had their place.
-    """
-
-    trace: NDArray[np.float32]
-    missing: NDArray[np.int64]
-    repeated: int
-
-
 class Start(NamedTuple):
     """Where an insertion begins.
 
@@ -191,7 +175,7 @@ class StartFinder:
 
 def place(
     times: Sequence[float], values: Floats, start: float, samples: int, step: float
-) -> Placed:
+) -> tuple[NDArray[np.float32], int]:
     """Put samples into a trace, each at the place (index of the trace) nearest to its time.
 
     Parameters
@@ -209,12 +193,13 @@ def place(
 
     Returns
     -------
-    Placed
-        The trace (C, samples) of float32, NaN at a place for which no sample came; these places,
-        increasing; and how many samples were left out because an earlier one had their place.
-        Samples nearest to a place before the first or after the last are left out, too, and not
-        counted. Halfway between two places, the even one gets the sample. A value that is too large
-        for float32 becomes an infinity.
+    trace : array of float32, shape (C, samples)
+        NaN at a place for which no sample came. Of several samples nearest to one place the first
+        counts; halfway between two places, the even one gets the sample. Samples nearest to a place
+        before the first or after the last are left out. A value that is too large for float32
+        becomes an infinity.
+    n_missing : int
+        Number of places for which no sample came.
     """
     trace = np.full((values.shape[1], samples), np.nan, dtype=np.float32)
     at = np.rint((np.asarray(times) - start) / step).astype(np.int64)
@@ -222,5 +207,4 @@ def place(
     places, first = np.unique(at[inside], return_index=True)
     with np.errstate(over="ignore"):  # what overflows becomes an infinity, which the engine finds
         trace[:, places] = values[inside][first].T
-    missing = np.setdiff1d(np.arange(samples), places)
-    return Placed(trace, missing, int(inside.sum()) - len(places))
+    return trace, samples - len(places)

@@ -163,7 +163,8 @@ class Decider(nn.Module):
 
         The fault is a position in `Reason`, 0 if the trace has none.
         """
-        return self.gate.check(x, float(self.sensor_limit.item()))
+        checked: tuple[int, int] = self.gate(x, float(self.sensor_limit.item()))
+        return checked
 
     def is_audited(self, content: int, rate: float) -> bool:
         """Return whether a trace with this content hash is audited: verified although certain.
@@ -222,4 +223,4 @@ def trace_gate(channels: int, samples: int) -> TraceGate:
 
     It is cached: it has no state, so all deciders share it.
     """
-    return TraceGate(TraceSpec(channels=channels, samples=samples))
+    return TraceGate(channels * samples)

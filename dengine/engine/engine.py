@@ -716,7 +716,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         else:
             cell.reject()
         if success is not None:
-            source = source_of(decision.action, decision.audit, success)
+            source = source_of(decision, success)
             try:
                 self.report(decision.id, success)
             except NotTakenError as error:

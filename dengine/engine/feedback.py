@@ -195,7 +195,7 @@ class Feedback:
         decision has any other label; then nothing is changed.
         """
         decision = stored.decision
-        source = source_of(decision.action, decision.audit, success)
+        source = source_of(decision, success)
         if stored.source is not None:
             earlier = (bool(stored.success), stored.source)
             reported = (success, source)

@@ -56,5 +56,10 @@ def envelope_of(successes: TraceArray, trace: TraceArray) -> Envelope | None:
         return None
     tail = (1.0 - CENTRAL) / 2.0
     low, median, high = np.quantile(successes, (tail, 0.5, 1.0 - tail), axis=0).astype(np.float32)
-    outside = float(((trace < low) | (trace > high)).mean())
-    return Envelope(n=len(successes), low=low, median=median, high=high, outside=outside)
+    return Envelope(
+        n=len(successes),
+        low=low,
+        median=median,
+        high=high,
+        outside=float(((trace < low) | (trace > high)).mean()),
+    )

@@ -24,7 +24,7 @@ import torch
 from ..decision.policy import Policy
 from ..errors import ReportConflictError, StoreError, UnknownDecisionError, shortened
 from ..recipe import Recipe
-from ..records import Action, Floats, Reason, Source, TraceArray, TraceSpec, stored_trace_spec
+from ..records import Action, Reason, Source, TraceArray, TraceSpec, stored_trace_spec
 from ..store.records import POLICY_KINDS, SAFE_MODE_BEGAN, StoredDecision, unknown_decision
 from ..store.views import HistoryFilter
 from .envelope import Envelope, envelope_of
@@ -136,8 +136,7 @@ def find_decision_id(store: SqlStore, part: str) -> str:
         If several decisions count; the message has their ids.
     """
     decisions = store.decisions.select(HistoryFilter(part=part), 20)
-    not_rejected = [item for item in decisions if item.decision.action is not Action.REJECT]
-    matches = not_rejected or decisions
+    matches = [item for item in decisions if item.decision.action is not Action.REJECT] or decisions
     if not matches and (item := store.decisions.get(part, trace=False)) is not None:
         matches = [item]
     if not matches:
@@ -213,18 +212,17 @@ def explain(store: SqlStore, decision_id: str, neighbours: int = 10) -> Explanat
         novelty=None if version is None else version.novelty,
         safe_mode=_find_safe_mode(store, item),
     )
-    distances = _measure_distances(item, version)
     bound = bound_of(decision, circumstances)
     return Explanation(
         decision=item,
         trace=item.trace,
         spec=circumstances.spec,
         sentences=tuple(explain_in_words(item, bound, circumstances)),
-        notes=(_note_of(item, distances is not None),),
+        notes=(_note_of(item, version is not None),),
         bound=bound,
         novelty=circumstances.novelty,
-        neighbours=tuple(_find_neighbours(store, version, distances, recipe.radius, neighbours)),
-        radius=None if distances is None else recipe.radius,
+        neighbours=tuple(_find_neighbours(store, version, item, recipe.radius, neighbours)),
+        radius=None if version is None or decision.embedding is None else recipe.radius,
         envelope=_find_envelope(store, item, version),
         policy=recipe.policy,
     )
@@ -251,57 +249,39 @@ def _find_safe_mode(store: SqlStore, item: StoredDecision) -> str:
     """
     if item.decision.reason is not Reason.SAFE_MODE:
         return ""
-    began = (
-        event.text
-        for event in reversed(store.events.newest())
-        if event.kind == SAFE_MODE_BEGAN and event.time <= item.time
-    )
-    return next(began, "")
-
-
-def _measure_distances(item: StoredDecision, version: PastVersion | None) -> Floats | None:
-    """Return the distances from a decision's embedding to the references of a version, shape (n,).
-
-    Each is measured in the embedding space of the reference, in which one radius means the same for
-    every reducer. They are in the order of the version's index of references. The distance to
-    references of the decision's own part (without a number, of a trace equal to its trace) is
-    infinite. None if the trace was not embedded or there is no version.
-    """
-    embedding = item.decision.embedding  # (K, d)
-    if version is None or embedding is None:
-        return None
-    query = torch.tensor(embedding, dtype=torch.float32)
-    squared = version.index.squared_distances(query, item.content_hash)
-    distances: Floats = np.sqrt(squared.double().numpy())
-    return distances
+    for event in reversed(store.events.newest()):
+        if event.kind == SAFE_MODE_BEGAN and event.time <= item.time:
+            return event.text
+    return ""
 
 
 def _find_neighbours(
-    store: SqlStore,
-    version: PastVersion | None,
-    distances: Floats | None,
-    radius: float,
-    n: int,
+    store: SqlStore, version: PastVersion | None, item: StoredDecision, radius: float, n: int
 ) -> Iterator[Neighbour]:
     """Yield the nearest references of other parts, at most `n`, with their traces, nearest first.
 
-    `distances` are those of `_measure_distances`, one for each reference. Nothing is yielded if
-    `version` or `distances` is None. A neighbour may lie outside of the radius, which only says
-    what its field `inside` is. If the decision behind a reference is unknown (another cell made it,
-    or its label is damaged), its id, part, source and trace are None. Label and source are those
-    that the version had, without later corrections. Raises StoreError for a damaged trace.
+    Each distance is measured in the embedding space of the reference, in which one radius means the
+    same for every reducer. References of the decision's own part (without a number, of a trace
+    equal to its trace) are left out. Nothing is yielded if `version` is None, or if the trace of
+    the decision was not embedded. A neighbour may lie outside of the radius, which only says what
+    its field `inside` is. If the decision behind a reference is unknown (another cell made it, or
+    its label is damaged), its id, part, source and trace are None. Label and source are those that
+    the version had, without later corrections. Raises StoreError for a damaged trace.
     """
-    if distances is None or version is None:
+    embedding = item.decision.embedding  # (K, d)
+    if version is None or embedding is None:
         return
     index = version.index
+    query = torch.tensor(embedding, dtype=torch.float32)
+    # Infinite to references of the decision's own part.
+    distances = np.sqrt(index.squared_distances(query, item.content_hash).double().numpy())
     for slot in np.argsort(distances, kind="stable")[:n]:
         if not np.isfinite(distances[slot]):
             return
         label = version.labels[slot]
-        decision_id = None if label is None else label.decision_id
-        stored = None if decision_id is None else store.decisions.get(decision_id)
+        stored = None if label is None else store.decisions.get(label.decision_id)
         yield Neighbour(
-            decision_id=decision_id,
+            decision_id=None if label is None else label.decision_id,
             part=None if stored is None else stored.decision.part,
             success=bool(index.column("labels")[slot]),
             source=None if label is None else label.source,
@@ -333,16 +313,14 @@ def _find_envelope(
     return None
 
 
-def _note_of(item: StoredDecision, has_neighbours: bool) -> str:
+def _note_of(item: StoredDecision, is_kept: bool) -> str:
     """Return a sentence that says which version's references the neighbours are.
 
     Without neighbours it says why, and names the first of these: the trace is quarantined, was not
-    embedded, or the version is not kept, which stands for all other reasons.
+    embedded, or the version that decided is not kept (unless `is_kept`).
     """
     decision = item.decision
     version = f"version {decision.model_version}, which answered,"
-    if has_neighbours:
-        return f"Neighbours: the references of {version} as they stood then."
     if item.quarantined:
         return (
             "The trace is quarantined: it was not embedded, is never trained on, and has no "
@@ -350,4 +328,6 @@ def _note_of(item: StoredDecision, has_neighbours: bool) -> str:
         )
     if decision.embedding is None:
         return "No neighbours are shown: the trace was not embedded."
-    return f"No neighbours are shown: {version} is not kept any more."
+    if not is_kept:
+        return f"No neighbours are shown: {version} is not kept any more."
+    return f"Neighbours: the references of {version} as they stood then."

@@ -3,7 +3,6 @@
 model with their labels, and the newest decisions.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -12,7 +11,6 @@ import numpy as np
 from ..recipe import Recipe
 from ..records import Action
 from ..reducers import has_own_unit
-from ..store.records import StoredDecision
 from ..store.views import HistoryFilter
 from .past_versions import load_past_version
 
@@ -106,51 +104,33 @@ def part_map(store: "SqlStore", recipe: Recipe, version: int) -> PartMap:
         If the store cannot be read.
     """
     recent = store.decisions.select(HistoryFilter(), N_NAMED)
-    newest = list(_newest_marks(recent[-N_NEWEST:], version))
-    newest_ids = {mark.id for mark in newest}
-    parts = {item.decision.id: item.decision.part for item in recent}
-    labelled = _known_marks(store, recipe, version, parts) if version else []
-    labelled = [mark for mark in labelled if mark.id not in newest_ids]
-    radius = recipe.radius if newest else None
-    return PartMap(version, (*labelled, *newest), radius, has_own_unit(recipe.reducer))
-
-
-def _newest_marks(items: list[StoredDecision], version: int) -> Iterator[Mark]:
-    """Yield a `Mark`, a point of the map, for each decision, at the mean of its K embeddings.
-
-    They are in the order of `items`; K is the number of embedding spaces. Decisions of another
-    version, and those without an embedding, are left out.
-    """
-    for item in items:
+    newest: dict[str, Mark] = {}
+    for item in recent[-N_NEWEST:]:
         decision = item.decision
         if decision.model_version == version and decision.embedding is not None:
-            x, y = _first_two(np.mean(decision.embedding, axis=0))
-            yield Mark(decision.id, decision.part, x, y, item.success, decision.action)
-
-
-def _known_marks(
-    store: "SqlStore", recipe: Recipe, version: int, parts: dict[str, str | None]
-) -> list[Mark]:
-    """Return a `Mark`, a point of the map, for each of a version's newest references, oldest first.
-
-    There are at most N_KNOWN (250). `recipe` is the recipe of that version. Labels are as they were
-    reported. References whose label this cell did not record, or is damaged, are left out; a
-    damaged one is reported by an event in the store. [] if `load_past_version` returns None, as for
-    a version without references; raises what it raises. `parts` maps decision ids to the parts'
-    numbers; the mark of an id that is missing there has no number. These marks have no action.
-    """
-    past = load_past_version(store, version, recipe, None)
-    if past is None:
-        return []
-    points = past.index.column("points")
-    labels = past.index.column("labels")
-    references = [
-        (label.seq, slot, label.decision_id) for slot, label in enumerate(past.labels) if label
-    ]
-    return [
-        Mark(id_, parts.get(id_), *_first_two(points[slot]), bool(labels[slot]), None)
-        for _, slot, id_ in sorted(references)[-N_KNOWN:]
-    ]
+            place = _first_two(np.mean(decision.embedding, axis=0))
+            newest[decision.id] = Mark(
+                decision.id, decision.part, *place, item.success, decision.action
+            )
+    known: list[Mark] = []
+    if version and (past := load_past_version(store, version, recipe, None)) is not None:
+        parts = {item.decision.id: item.decision.part for item in recent}
+        points = past.index.column("points")
+        labels = past.index.column("labels")
+        references = sorted(
+            (label.seq, slot, label.decision_id) for slot, label in enumerate(past.labels) if label
+        )
+        known = [
+            Mark(id_, parts.get(id_), *_first_two(points[slot]), bool(labels[slot]), None)
+            for _, slot, id_ in references[-N_KNOWN:]
+            if id_ not in newest
+        ]
+    return PartMap(
+        version=version,
+        marks=(*known, *newest.values()),
+        radius=recipe.radius if newest else None,
+        probability=has_own_unit(recipe.reducer),
+    )
 
 
 def _first_two(point: np.ndarray) -> tuple[float, float]:

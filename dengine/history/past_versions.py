@@ -8,7 +8,6 @@ import sys
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-import numpy as np
 import torch
 
 from ..decision.member_rules import MemberRule
@@ -109,7 +108,11 @@ def load_past_version(
     last = min([*later_retrains[:1], stored.last_seq + MAX_LABELS])
     later = store.labels.past(stored.last_seq, last)
     if item is not None:
-        later = [label for label in later if _was_known(label, item)]
+        later = [
+            label
+            for label in later
+            if label.time <= item.time and label.decision_id != item.decision.id
+        ]
     before = store.labels.past(int(stored.state["trained_on"][0]) - 1, stored.last_seq)
     by_number = {label.seq: label for label in (*before, *later) if not label.quarantined}
     added = [label for label in later if label.model_version == version]
@@ -121,11 +124,6 @@ def load_past_version(
         last_seq=max(by_number, default=stored.last_seq),
         novelty=_score_novelty(stored, item),
     )
-
-
-def _was_known(label: PastLabel, item: StoredDecision) -> bool:
-    """Return whether the engine knew a label when it made the decision `item`; never its own."""
-    return label.time <= item.time and label.decision_id != item.decision.id
 
 
 def _restore_index(stored: ModelVersion, added: list[PastLabel], recipe: Recipe) -> RadiusIndex:
@@ -143,9 +141,14 @@ def _restore_index(stored: ModelVersion, added: list[PastLabel], recipe: Recipe)
     index = RadiusIndex.from_state(stored.state, n if is_full else max(n, recipe.window))
     for label in added:
         if label.point is not None:
-            fold = int(fold_of(np.array([label.content_hash], dtype=np.int64), spaces)[0])
-            point = torch.from_numpy(label.point)
-            index.add_one(point, float(label.success), fold, label.content_hash, label.seq)
+            fold = int(fold_of(label.content_hash, spaces))
+            index.add_one(
+                torch.from_numpy(label.point),
+                float(label.success),
+                fold,
+                label.content_hash,
+                label.seq,
+            )
     return index
 
 
@@ -250,9 +253,8 @@ def load_rule(store: SqlStore, policy: Policy) -> DecisionRule | None:
     settings = store.settings.read()
     if stored is None or (rule := _restore_rule(stored, policy)) is None:
         return None
-    since = int(settings.get("evidence_since", 0))
-    began_in = int(settings.get("began_in", 0))
-    policy_since = int(settings.get("policy_since", 0))
+    names = ("evidence_since", "began_in", "policy_since")
+    since, began_in, policy_since = (int(settings.get(name, 0)) for name in names)
     progress = read_rule_progress(store, stored, since, policy.label_within, policy_since)
     if not progress.last_seq:  # rebuilt from all outcomes, as when an engine is opened
         rule = rule.clone()

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,7 +13,7 @@ import torch
 
 from ..decision.intervals import SORTING_GUARANTEES, interval_error_level
 from ..decision.members import CLOSED
-from ..decision.policy import RULES, Policy
+from ..decision.policy import RULES
 from ..errors import outward
 from ..recipe import Recipe
 from ..records import Action, Decision, Reason, TraceArray, TraceSpec
@@ -124,20 +124,12 @@ def _find_thresholds(circumstances: Circumstances) -> tuple[float | None, float 
     if circumstances.thresholds is None:
         return None, None, "the thresholds of that time are not kept"
     accept_score, reject_score = circumstances.thresholds
-    sorts = policy.guarantee in SORTING_GUARANTEES
-    origin = "the lowest level that held then" if sorts else "what held in safe mode"
+    origin = "what held in safe mode"
+    if policy.guarantee in SORTING_GUARANTEES:
+        origin = "the lowest level that held then"
     accept_threshold = accept_score if accept_score < CLOSED else None
     reject_threshold = 1.0 - reject_score if reject_score < CLOSED else None
     return accept_threshold, reject_threshold, origin
-
-
-def _is_score(policy: Policy, decision: Decision) -> bool:
-    """Return whether a decision's `lower` and `upper` are one score, and no interval.
-
-    True under the guarantees "pooled" and "cost" if lower equals upper. The score is then the mean
-    success probability that the reducer's classifier heads give.
-    """
-    return policy.guarantee in SORTING_GUARANTEES and decision.lower == decision.upper
 
 
 def explain_in_words(
@@ -150,71 +142,62 @@ def explain_in_words(
     that nothing was reported, which it also says of a forgotten label.
     """
     decision = item.decision
-    reason = WHY[decision.reason](decision, item.trace, circumstances)
+    reason = _explain_reason(decision, item.trace, circumstances)
     yield DID[decision.action].capitalize() + reason
     if bound is not None:
         yield from _bound_sentences(decision, bound, circumstances)
     if item.success is None:
         yield "Nothing was reported of the part."
     else:
-        source = "" if item.source is None else f" ({item.source.value})"
-        yield f"The part turned out {item.label}{source}."
+        yield f"The part turned out {item.label} ({item.source})."
 
 
-def _explain_outside(decision: Decision, trace: TraceArray, circumstances: Circumstances) -> str:
-    """Return the end of the sentence on a trace outside the force limits: which limits it leaves.
+def _explain_reason(decision: Decision, trace: TraceArray, circumstances: Circumstances) -> str:
+    """Return the end of the sentence that begins with what was done, like "Rejected": why.
 
-    The sentence begins with what was done, like "Rejected". The force limits of the policy of that
-    time are checked again, one by one. If the trace leaves none of them now, the sentence says that
-    it is not known which. Raises SettingError for a force limit that does not fit the trace.
+    Raises SettingError for a part outside the force limits if one does not fit the trace.
+    """
+    if decision.reason is Reason.OUTSIDE:
+        left = " and ".join(_limits_left(trace, circumstances)) or "which is not known"
+        return f": it leaves the operator's force limits, {left}, whatever the model says."
+    n_bad = (~np.isfinite(trace)).sum()
+    novelty = "" if circumstances.novelty is None else f": {circumstances.novelty}"
+    alarm = circumstances.safe_mode or "its reason is not kept"
+    return {
+        Reason.CERTAIN: ": the bound meets the policy.",
+        Reason.UNCERTAIN: ": the bound does not meet the policy.",
+        Reason.NO_MODEL: ": no model had been trained yet, so every part was verified.",
+        Reason.AUDIT: f" as an audit: the model alone would have {DID[decision.predicted]} it.",
+        Reason.NOT_FINITE: f": {n_bad} of {trace.size} samples are NaN or infinite.",
+        Reason.CONSTANT: ": every sample has the same value: a dead sensor.",
+        Reason.SATURATED: ": the trace touched the sensor's range.",
+        Reason.TOO_LARGE: (
+            f": a sample is beyond {LARGEST:g}, where nothing can be computed from it."
+        ),
+        Reason.MODEL_ERROR: ": the model raised an error; see the log of that time.",
+        Reason.NOVEL: (
+            f": unlike all traces that were learned from{novelty}. "
+            "The labels of its neighbours do not count then."
+        ),
+        Reason.SAFE_MODE: f" in safe mode, which began after an alarm: {alarm}.",
+        Reason.NO_STORE: (
+            ": the disk or the store did not respond in time, so the decision could not be "
+            "recorded, or its id could not be looked up, and the model was not asked."
+        ),
+        Reason.LATE: ": the caller timed out and verified the part, so the model was not asked.",
+    }[decision.reason]
+
+
+def _limits_left(trace: TraceArray, circumstances: Circumstances) -> Iterator[str]:
+    """Yield each force limit of the policy of that time that a trace leaves, as text.
+
+    They are checked again, one by one; there may be none now. Raises SettingError for a force limit
+    that does not fit the trace.
     """
     x = torch.from_numpy(trace)
-    left = [
-        str(limits)
-        for limits in circumstances.recipe.policy.force_limits
-        if ForceLimitsGate([limits], circumstances.spec)(x) != WITHIN_LIMITS
-    ]
-    return (
-        f": it leaves the operator's force limits, {' and '.join(left) or 'which is not known'}, "
-        "whatever the model says."
-    )
-
-
-# For each reason the rest of the sentence that begins with what was done.
-WHY: dict[Reason, Callable[[Decision, TraceArray, Circumstances], str]] = {
-    Reason.CERTAIN: lambda *_: ": the bound meets the policy.",
-    Reason.UNCERTAIN: lambda *_: ": the bound does not meet the policy.",
-    Reason.NO_MODEL: lambda *_: ": no model had been trained yet, so every part was verified.",
-    Reason.AUDIT: lambda decision, *_: (
-        f" as an audit: the model alone would have {DID[decision.predicted]} it."
-    ),
-    Reason.NOT_FINITE: lambda decision, trace, circumstances: (
-        f": {(~np.isfinite(trace)).sum()} of {trace.size} samples are NaN or infinite."
-    ),
-    Reason.CONSTANT: lambda *_: ": every sample has the same value: a dead sensor.",
-    Reason.SATURATED: lambda *_: ": the trace touched the sensor's range.",
-    Reason.TOO_LARGE: lambda *_: (
-        f": a sample is beyond {LARGEST:g}, where nothing can be computed from it."
-    ),
-    Reason.MODEL_ERROR: lambda *_: ": the model raised an error; see the log of that time.",
-    Reason.NOVEL: lambda decision, trace, circumstances: (
-        ": unlike all traces that were learned "
-        f"from{'' if circumstances.novelty is None else f': {circumstances.novelty}'}. "
-        "The labels of its neighbours do not count then."
-    ),
-    Reason.SAFE_MODE: lambda decision, trace, circumstances: (
-        " in safe mode, which began after an alarm: "
-        f"{circumstances.safe_mode or 'its reason is not kept'}."
-    ),
-    Reason.NO_STORE: lambda *_: (
-        ": the disk or the store did not respond in time, so the decision could not be recorded, "
-        "or its id could not be looked up, and the model was not asked."
-    ),
-    Reason.LATE: lambda *_: (
-        ": the caller timed out and verified the part, so the model was not asked."
-    ),
-    Reason.OUTSIDE: _explain_outside,
-}
+    for limits in circumstances.recipe.policy.force_limits:
+        if ForceLimitsGate([limits], circumstances.spec)(x) != WITHIN_LIMITS:
+            yield str(limits)
 
 
 def _bound_sentences(
@@ -238,7 +221,7 @@ def _bound_sentences(
     counts = (
         f"{decision.n_success} of {n} labels {within} are successes" if n else f"No label {within}"
     )
-    if _is_score(policy, decision):
+    if policy.guarantee in SORTING_GUARANTEES and decision.lower == decision.upper:
         yield (
             f"{counts}; the heads give it {decision.lower:.6g}, the mean of what each says "
             "of its success."

@@ -15,7 +15,7 @@ import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
-from itertools import islice
+from itertools import takewhile
 from typing import TYPE_CHECKING, Any
 
 from ..decision.certificate import Certificate
@@ -282,15 +282,12 @@ class Status:
         newest = self.newest
         accepts = newest.bad_accepts
         would_accept = newest.would_accept
-        tolerance = self.recipe.policy.tolerances[1]
-        rejects = _estimate_error(newest.rejected, newest.false_rejects, tolerance)
+        rejects = _estimate_error(
+            newest.rejected, newest.false_rejects, self.recipe.policy.tolerances[1]
+        )
         reports = [retrain.report for retrain in self.retrains]
-        newest_accepted = max(
-            (i for i, report in enumerate(reports, 1) if report.accepted), default=0
-        )
-        failing = retrain_fault(
-            [report.reason for report in reports[newest_accepted:]], self.version
-        )
+        dropped = takewhile(lambda report: not report.accepted, reversed(reports))
+        failing = retrain_fault([report.reason for report in dropped][::-1], self.version)
         trained = [report.reason for report in reports if report.reason.startswith(TRAINED)]
         repeats = re.search(rf"[^;:]* {REPEATS}", "".join(trained[-1:]))
         alarms = (
@@ -390,21 +387,19 @@ def status(store: SqlStore, last: int = NEWEST, watching: bool = False) -> Statu
         )
     recipe = Recipe.from_store(settings)
     policy = recipe.policy
-    tally = store.decisions.tally(
-        within=policy.label_within
-    )  # seconds, in a store of a million decisions
+    within = policy.label_within
+    tally = store.decisions.tally(within=within)  # seconds, in a store of a million decisions
     counts = store.decisions.counts(tally)
     outcomes = tally.outcomes
     events = store.events.newest()
     losses = [event.text for event in open_losses(events)]
-    mode = next((event for event in reversed(events) if event.kind in MODES), None)
+    modes = (SAFE_MODE_BEGAN, SAFE_MODE_ENDED)
+    mode = next((event for event in reversed(events) if event.kind in modes), None)
     retrains = store.versions.all(cell_only=True)
     last_seq = retrains[-1].last_seq if retrains else 0
     accepted = [report for report in store.versions.retrains() if report.accepted]
     since = int(settings.get("policy_since", 0))
-    in_force = tally
-    if since:
-        in_force = store.decisions.tally(since_version=since, within=policy.label_within)
+    in_force = store.decisions.tally(since_version=since, within=within) if since else tally
     return Status(
         cell=store.cell_id,
         product=store.product,
@@ -444,7 +439,6 @@ def _read_pinned(store: SqlStore, accepted: list[RetrainReport]) -> int:
     return 0 if version is None else int(version.state.get("pinned", 0))
 
 
-MODES = (SAFE_MODE_BEGAN, SAFE_MODE_ENDED)
 COUNTED = ("actions", "reasons", "labels", "sources", "corrected", "forgotten")
 
 
@@ -575,10 +569,9 @@ def bad_accepts(outcomes: Outcomes, policy: Policy) -> ErrorEstimate:
     audited = _estimate_error(
         outcomes.audited_accepts, outcomes.audited_accepts_bad, tolerance, policy.alpha, n
     )
-    others = outcomes.accepted - outcomes.false_accepts
-    by_stops = 1.0 - wilson_interval(others, outcomes.false_accepts, policy.alpha)[1]
-    lower = max(audited.lower, by_stops)
-    upper = max(audited.upper, outcomes.false_accepts / max(1, outcomes.accepted))
+    stops = _estimate_error(outcomes.accepted, outcomes.false_accepts, tolerance, policy.alpha)
+    lower = max(audited.lower, stops.lower)
+    upper = max(audited.upper, outcomes.false_accepts / outcomes.accepted)
     return replace(audited, lower=lower, upper=upper, verdict=_verdict(lower, upper, tolerance))
 
 
@@ -627,7 +620,7 @@ def read_watch(store: SqlStore, recipe: Recipe, mode: Event | None) -> Watch | N
 
 @dataclass(frozen=True, slots=True)
 class Course:
-    """The course of a store over time, from which its picture is drawn.
+    """The course of a store over time, from which the web page draws its picture.
 
     Attributes
     ----------
@@ -635,38 +628,24 @@ class Course:
         Counts over consecutive decisions, oldest first.
     retrains : list of StoredVersion
         Of this cell.
-    modes : list of Event
-        Those that began or ended safe mode, oldest first.
-    tolerance : float
-        Share of accepted parts that may be bad (`Policy.tolerances`).
-    last : int
-        Number of newest decisions that are marked.
     """
 
     stretches: list[Stretch]
     retrains: list[StoredVersion]
-    modes: list[Event]
-    tolerance: float
-    last: int
 
 
 MAX_STRETCHES = 120  # of a picture
 MIN_STRETCH = 20  # decisions of a stretch: a share of fewer jumps
 
 
-def read_course(store: SqlStore, recipe: Recipe, last: int, **by: Any) -> Course:
-    """Read the course of a store: counts over time, retrains, safe modes.
+def read_course(store: SqlStore, **by: float) -> Course:
+    """Read the course of a store: counts over time, and retrains.
 
     A stretch is a number of consecutive decisions that are counted together.
 
     Parameters
     ----------
     store : SqlStore
-    recipe : Recipe
-        With the policy's tolerance.
-    last : int
-        Number of newest decisions that the picture marks. It is copied to `Course.last` and has no
-        other effect.
     **by
         `seconds` and `start`, for stretches that are periods of time (see `stretches_query`); only
         the newest 120 with decisions are returned. Without them all decisions of the cell are split
@@ -675,13 +654,13 @@ def read_course(store: SqlStore, recipe: Recipe, last: int, **by: Any) -> Course
     Returns
     -------
     Course
-        It has all retrains and safe modes of this cell, also those before the first stretch.
+        It has all retrains of this cell, also those before the first stretch.
     """
-    modes = [event for event in store.events.newest() if event.kind in MODES]
     n = max(1, min(MAX_STRETCHES, store.decisions.newest_number() // MIN_STRETCH))
-    stretches = store.decisions.stretches(n, **by)[-MAX_STRETCHES:]
-    retrains = store.versions.all(cell_only=True)
-    return Course(stretches, retrains, modes, recipe.policy.tolerances[0], last)
+    return Course(
+        stretches=store.decisions.stretches(n, **by)[-MAX_STRETCHES:],
+        retrains=store.versions.all(cell_only=True),
+    )
 
 
 def history(store: SqlStore, last: int | None = None, **where: Any) -> Iterator[StoredDecision]:
@@ -708,9 +687,8 @@ def history(store: SqlStore, last: int | None = None, **where: Any) -> Iterator[
     TypeError
         For a name that is no field.
     """
-    is_valid = last is None or 1 <= last < MAX_LAST
     expect(
-        is_valid,
+        last is None or 1 <= last < MAX_LAST,
         f"last to be 1 or more, below {MAX_LAST:,}",
         last,
         "leave it out for all decisions",
@@ -718,8 +696,7 @@ def history(store: SqlStore, last: int | None = None, **where: Any) -> Iterator[
     selection = HistoryFilter(**where)
     if last is None:
         return iterate_decisions(store, selection, newest_first=False)
-    newest = islice(iterate_decisions(store, selection, min(PAGE_SIZE, last)), last)
-    return iter(list(newest)[::-1])
+    return iter(store.decisions.select(selection, last))
 
 
 def iterate_decisions(
@@ -751,8 +728,10 @@ def iterate_decisions(
         Without its trace.
     """
     while page := store.decisions.select(where, page_size, start_after, newest_first):
-        yield from reversed(page) if newest_first else page
-        start_after = (page[0] if newest_first else page[-1]).decision.id
+        if newest_first:
+            page.reverse()
+        yield from page
+        start_after = page[-1].decision.id
 
 
 def as_frame(decisions: Iterable[StoredDecision]) -> pd.DataFrame:

@@ -644,7 +644,7 @@ class ModelPrediction(EngineModel):
         AttributeError if nothing was fitted.
         """
         # The fold of a hash is also the space of its reference.
-        fold = int(fold_of(np.array([hash_], dtype=np.int64), self.n_spaces)[0])
+        fold = int(fold_of(hash_, self.n_spaces))
         if point is None:
             if embedding is None:
                 with torch.inference_mode():

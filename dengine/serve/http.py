@@ -408,13 +408,13 @@ class HttpApi:
         return await self.service.read(lambda store: _read_explanation(store, id_))
 
     async def course(self, hours: ShiftHours = 0.0, start: ShiftStart = 0.0) -> Json:
-        """Return counts of the decisions in stretches, oldest first, with retrains and safe modes.
+        """Return counts of the decisions in stretches, oldest first, with retrains.
 
         A stretch is a number of decisions that are counted together. With `hours` a stretch is a
         shift of this length, and `start` is when one of the shifts begins. Without it all decisions
         are split into at most 120 stretches of at least 20 decisions; the newest stretch may have
-        fewer. At most the newest 120 stretches with decisions are returned, but all retrains and
-        safe modes of the cell. 422: `hours` is not 0 and below 0.0003, about a second; 503: the
+        fewer. At most the newest 120 stretches with decisions are returned, but all retrains of the
+        cell. 422: `hours` is not 0 and below 0.0003, about a second; 503: the
         queue is full, or the store cannot be read.
         """
         expect(
@@ -422,9 +422,8 @@ class HttpApi:
             f"hours of 0, or of {MIN_SHIFT_HOURS} or more, a second",
             hours,
         )
-        recipe = self.service.engine.recipe
         by = {"seconds": 3600.0 * hours, "start": 3600.0 * start}
-        course = await self.service.read(lambda store: read_course(store, recipe, N_LABELS, **by))
+        course = await self.service.read(lambda store: read_course(store, **by))
         return response_fields("Course", course)
 
     async def embedding(self) -> Json:

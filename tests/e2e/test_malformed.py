@@ -167,5 +167,5 @@ def test_a_bomb_is_refused_by_what_it_claims_and_only_what_is_wanted_counts(monk
     assert len(bomb) < 2**17
     monkeypatch.setattr("dengine.files.MAX_BYTES", 2**20)
     assert set(read_archive(bomb, ["X"])[0]) == {"X"}
-    with pytest.raises(DataError, match=r"at most 1\.0 MB of arrays in .*, got 8\.0 MB"):
+    with pytest.raises(DataError, match=r"at most 1 MB of arrays in .*, got 8 MB"):
         read_archive(bomb)

@@ -132,3 +132,5 @@ def test_a_folder_with_somebody_elses_picture_keeps_it_and_the_tables_are_shown(
     assert (tmp_path / "map_pca.png").read_bytes() == TEXT
     assert "certain" in done.output  # what took long is shown all the same
     assert dengine(*words, "--force").exit_code == 0
+    written = {file.name for file in tmp_path.iterdir() if file.read_bytes() != TEXT}
+    assert {file.name for file in tmp_path.iterdir()} - written == {"data.png"}

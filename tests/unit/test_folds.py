@@ -58,7 +58,7 @@ def test_the_hash_of_a_trace_never_changes(name):
     x = np.atleast_2d(golden_traces()[name])
     h = content_hash(x[None])
     assert (*h, *toss(h), *fold_of(h, 2), *fold_of(h, 5)) == GOLDEN[name]
-    gate = script(TraceGate(TraceSpec(samples=x.shape[1], channels=x.shape[0])))
+    gate = script(TraceGate(x.size))
     assert gate(torch.from_numpy(x))[1] == h[0]  # compiled, as in an exported file
 
 
@@ -72,7 +72,7 @@ def test_a_hash_depends_on_the_values_of_its_trace_alone():
 
 @given(traces)
 def test_the_scripted_gate_hashes_as_numpy_does_for_any_float(x):
-    gate = TraceGate(TraceSpec(samples=x.shape[1], channels=x.shape[0]))
+    gate = TraceGate(x.size)
     assert gate(torch.from_numpy(x))[1] == content_hash(x[None])[0]
 
 

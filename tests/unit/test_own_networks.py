@@ -207,7 +207,7 @@ def test_a_model_that_answers_otherwise_than_it_was_trained_is_neither_exported_
     with pytest.raises(ExportError, match="lies elsewhere than the reducer embeds it"):
         export_torchscript(model, tmp_path / "model.ts")
     for network, broken in (
-        (OtherwiseCompiled, "its_module_compiles_and_embeds_as_it_does"),
+        (OtherwiseCompiled, "a_version_answers_as_it_was_trained"),
         (CountsItsCalls, "it_embeds"),
     ):
         with pytest.raises(AssertionError, match=broken):

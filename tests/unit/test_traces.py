@@ -1,6 +1,7 @@
 """Where a trace enters: shapes and types are the caller's, faults are the world's."""
 
 import json
+import math
 from contextlib import nullcontext
 from dataclasses import asdict, replace
 
@@ -35,8 +36,9 @@ def ramp(samples: int = 100, channels: int = 1) -> np.ndarray:
 
 
 def reason_of(x: np.ndarray, limit: float | None = None, compiled: bool = False) -> Reason:
-    gate = TraceGate(TraceSpec(samples=x.shape[1], channels=x.shape[0], limit=limit))
-    return REASONS[(script(gate) if compiled else gate)(torch.from_numpy(x))[0]]
+    gate = TraceGate(x.size)
+    x = torch.from_numpy(x)
+    return REASONS[(script(gate) if compiled else gate)(x, limit or math.inf)[0]]
 
 
 UNITS = [

@@ -193,16 +193,14 @@ def _find_cause(conditions: Conditions, pushed: Push) -> str:
     return "stuck" if tip_mm <= STUCK_MM else "wedging"
 
 
-def _make_generators(
-    seed: int, cycle: int
-) -> tuple[np.random.Generator, np.random.Generator, np.random.Generator]:
+def _make_generators(seed: int, cycle: int) -> list[np.random.Generator]:
     """Return three independent random generators of one cycle: for the physical conditions, for the
     sensor, and for what becomes known of a part that was passed on.
 
     They depend on seed and cycle alone.
     """
-    world, sensor, line = np.random.SeedSequence(entropy=seed, spawn_key=(cycle,)).spawn(3)
-    return np.random.default_rng(world), np.random.default_rng(sensor), np.random.default_rng(line)
+    seeds = np.random.SeedSequence(entropy=seed, spawn_key=(cycle,)).spawn(3)
+    return [np.random.default_rng(part) for part in seeds]
 
 
 class SimulatedCell:
@@ -246,7 +244,6 @@ class SimulatedCell:
     ) -> None:
         expect(cycles >= 1, "cycles of at least 1", cycles, "give the length of the run")
         self.parameters = parameters or CellParameters()
-        self.scenario = scenario
         self.seed = seed
         self.cycles = cycles
         self.clock = 0.0
@@ -293,17 +290,15 @@ class SimulatedCell:
         """Pass the part on without a check; return what became known of it.
 
         A bad part stops the line: the result is STOPPED, and `clock` goes on by `stop_s` seconds.
-        But with the probability `unreported_share` nothing becomes known of a bad part (UNKNOWN). A
-        good part is CONFIRMED with the probability `confirm_share`, else UNKNOWN. All three are
-        fields of `CellParameters`. The same seed and cycle have the same result. Afterwards no part
-        waits. Raise DengineError if no part waits for a decision.
+        But with the probability `unreported_share` nothing becomes known of a bad part (UNKNOWN).
+        Both are fields of `CellParameters`. Nothing becomes known of a good part. The same seed and
+        cycle have the same result. Afterwards no part waits. Raise DengineError if no part waits
+        for a decision.
         """
         success = self._take_waiting("proceed").success
         # It depends on the part alone.
         chance = float(_make_generators(self.seed, self._done - 1)[2].random())
-        if success:
-            return Outcome.CONFIRMED if chance < self.parameters.confirm_share else Outcome.UNKNOWN
-        if chance < self.parameters.unreported_share:
+        if success or chance < self.parameters.unreported_share:
             return Outcome.UNKNOWN
         self.clock += self.parameters.stop_s
         return Outcome.STOPPED

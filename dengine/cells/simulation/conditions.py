@@ -32,8 +32,6 @@ class CellParameters:
         included.
     unreported_share : float
         Probability that a bad part which was passed on does not stop the line.
-    confirm_share : float
-        Probability that a good part which was passed on is confirmed as good later.
     height_tolerance_mm : float
         A part is good if the height of its top differs from the nominal one by at most this.
     offset_sd_mm, tilt_sd_deg, yaw_sd_deg : float
@@ -83,7 +81,6 @@ class CellParameters:
     stop_s: float = 120.0
 
     unreported_share: float = 0.1
-    confirm_share: float = 0.0
 
     height_tolerance_mm: float = 0.5
 
@@ -209,7 +206,6 @@ def draw_conditions(parameters: CellParameters, rng: np.random.Generator) -> Con
         For a range whose first number is larger than its second, a negative standard deviation, or
         probabilities of faults that are negative or add up to more than 1.
     """
-    p = parameters
 
     def draw(setting: str | Range) -> float:
         """Draw a value: by a setting's name, or in a range.
@@ -217,7 +213,7 @@ def draw_conditions(parameters: CellParameters, rng: np.random.Generator) -> Con
         A range is drawn uniformly, a single number is the standard deviation of a normal draw
         around 0.
         """
-        value = getattr(p, setting) if isinstance(setting, str) else setting
+        value = getattr(parameters, setting) if isinstance(setting, str) else setting
         return float(rng.uniform(*value) if isinstance(value, tuple) else rng.normal(0.0, value))
 
     without_fault = {"fault": "none", "extra_width_mm": 0.0, "debris_mm": 0.0}
@@ -225,16 +221,15 @@ def draw_conditions(parameters: CellParameters, rng: np.random.Generator) -> Con
     names = [field.name for field in fields(Conditions) if field.name not in without_fault]
     values = {name: draw(_DRAWN_BY.get(name, name)) for name in names}
     normal = Conditions(**without_fault, **values)  # type: ignore[arg-type]
-    weak_grip_n = draw("weak_grip_n")
-    debris_mm = draw("debris_mm")
-    extra_length_mm = draw("extra_length_mm") * float(rng.choice((-1, 1)))
-    extra_width_mm = draw("extra_width_mm") * float(rng.choice((-1, 1)))
     changes: dict[str, dict[str, float]] = {
-        "weak_grip": {"grip_n": weak_grip_n},
-        "debris": {"debris_mm": debris_mm},
-        "wrong_part": {"extra_length_mm": extra_length_mm, "extra_width_mm": extra_width_mm},
+        "weak_grip": {"grip_n": draw("weak_grip_n")},
+        "debris": {"debris_mm": draw("debris_mm")},
+        "wrong_part": {
+            name: draw(name) * float(rng.choice((-1, 1)))
+            for name in ("extra_length_mm", "extra_width_mm")
+        },
     }
-    shares = [p.missed_grasp, p.weak_grip, p.debris, p.wrong_part]
+    shares = [getattr(parameters, fault) for fault in FAULTS]
     fault = str(rng.choice(["none", *FAULTS], p=[1 - sum(shares), *shares]))
     return replace(normal, fault=fault, **changes.get(fault, {}))
 

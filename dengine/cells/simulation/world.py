@@ -82,9 +82,8 @@ def push(conditions: Conditions, time_step_s: float = TIME_STEP_S) -> Push:
     ):
         import mujoco
     steps = round(1 / RATE_HZ / time_step_s)
-    divides = math.isclose(steps * time_step_s, 1 / RATE_HZ)
     expect(
-        divides,
+        math.isclose(steps * time_step_s, 1 / RATE_HZ),
         "a time step in seconds that divides 2 ms",
         time_step_s,
         "take 0.0005 or half of it",
@@ -134,18 +133,17 @@ def _drive(mujoco: Any, model: Any, data: Any, conditions: Conditions, steps: in
     return force
 
 
-def cell_xml(conditions: Conditions, time_step_s: float = TIME_STEP_S) -> str:
-    """Return the MuJoCo model of the whole cell under these conditions, as text in MJCF.
+def cell_xml(c: Conditions, time_step_s: float = TIME_STEP_S) -> str:
+    """Return the MuJoCo model of the whole cell under the conditions `c`, as text in MJCF.
 
     It has the fixture, the carriage, which a drive moves up and down, the elastic wrist with the
     force sensor, and the part, unless the grasp missed it. `time_step_s` is the step of the physics
     in seconds.
     """
-    c = conditions
     tool_z = (c.gap_mm + c.protrusion_mm + PROTRUSION_MM) / 1000 + 0.06
-    k_lateral = 1000 * c.lateral_n_mm
-    k_axial = 1000 * c.axial_n_mm
-    k_angular = c.angular_nm_rad
+    lateral = _spring(1000 * c.lateral_n_mm, 1.0)
+    axial = _spring(1000 * c.axial_n_mm, 1.0)
+    angular = _spring(c.angular_nm_rad, 0.004)
     return f"""
 <mujoco model="simulated insertion">
   <compiler angle="radian" autolimits="true"/>
@@ -161,18 +159,12 @@ def cell_xml(conditions: Conditions, time_step_s: float = TIME_STEP_S) -> str:
       <joint name="drive" type="slide" axis="0 0 1" damping="20"/>
       <inertial pos="0 0 0" mass="4" diaginertia="0.02 0.02 0.02"/>
       <body name="wrist" gravcomp="1">
-        <joint type="slide" axis="1 0 0" stiffness="{k_lateral}"
-               damping="{_damping(k_lateral, 1.0)}"/>
-        <joint type="slide" axis="0 1 0" stiffness="{k_lateral}"
-               damping="{_damping(k_lateral, 1.0)}"/>
-        <joint type="slide" axis="0 0 1" stiffness="{k_axial}"
-               damping="{_damping(k_axial, 1.0)}"/>
-        <joint type="hinge" axis="1 0 0" stiffness="{k_angular}"
-               damping="{_damping(k_angular, 0.004)}"/>
-        <joint type="hinge" axis="0 1 0" stiffness="{k_angular}"
-               damping="{_damping(k_angular, 0.004)}"/>
-        <joint type="hinge" axis="0 0 1" stiffness="{k_angular}"
-               damping="{_damping(k_angular, 0.004)}"/>
+        <joint type="slide" axis="1 0 0" {lateral}/>
+        <joint type="slide" axis="0 1 0" {lateral}/>
+        <joint type="slide" axis="0 0 1" {axial}/>
+        <joint type="hinge" axis="1 0 0" {angular}/>
+        <joint type="hinge" axis="0 1 0" {angular}/>
+        <joint type="hinge" axis="0 0 1" {angular}/>
         <inertial pos="0 0 0" mass="0.2" diaginertia="0.0003 0.0003 0.0003"/>
         <body name="tool" gravcomp="1">
           <inertial pos="0 0 -0.03" mass="0.6" diaginertia="0.0006 0.0006 0.0003"/>
@@ -189,9 +181,10 @@ def cell_xml(conditions: Conditions, time_step_s: float = TIME_STEP_S) -> str:
 </mujoco>"""
 
 
-def _damping(stiffness: float, inertia: float, ratio: float = 0.6) -> float:
-    """Return the viscous damping of a spring; `ratio` is the share of critical damping."""
-    return 2 * ratio * math.sqrt(stiffness * inertia)
+def _spring(stiffness: float, inertia: float) -> str:
+    """Return a spring's attributes in MJCF; its viscous damping is 0.6 of the critical damping."""
+    damping = 2 * 0.6 * math.sqrt(stiffness * inertia)
+    return f'stiffness="{stiffness}" damping="{damping}"'
 
 
 def _part_xml(c: Conditions) -> str:

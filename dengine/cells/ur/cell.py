@@ -15,6 +15,7 @@ starts anew writes the result code VOID for an order that it finds. `ur_cell.scr
 file is such a program.
 """
 
+import time
 from contextlib import AbstractContextManager
 from dataclasses import replace
 from enum import IntEnum
@@ -30,6 +31,7 @@ ORDER = "input_int_register_24"
 ANSWER = "output_int_register_24"
 PHASE = "output_int_register_25"
 RUNTIME = "runtime_state"
+REPEAT_S = 10.0  # an order is written again on a new connection if it is at most this old
 MAX_NUMBER = 2 * 10**8  # of an order, then 1 again; ten times as much still fits an int32
 
 
@@ -133,10 +135,11 @@ class UrCell(AbstractContextManager["UrCell"]):
         self.last: InsertionRecord | None = None
         self.incomplete = 0
         try:
-            self._number = self._wait_until_ready()
+            self._newest = self._wait_until_ready()  # package of the controller
         except BaseException:
             self.close()
             raise
+        self._number = int(self._newest.values[ORDER]) // 10  # of the last order
 
     def close(self) -> None:
         """Close the connection and end its thread; the robot's program goes on."""
@@ -186,27 +189,34 @@ class UrCell(AbstractContextManager["UrCell"]):
         """Send an order (`verb`) to the robot, wait for its result, and return the result.
 
         It waits at most `order_timeout` seconds. Packages that were received before are discarded.
-        If the connection is lost meanwhile, the order is written again on the next one, as
-        `RtdeStream.write` says. The order INSERT also waits, within the same time, for the end of a
-        trace that has begun. It sets `last` to the insertion, or to None if none was complete by
-        then. Raise CellError if the robot does not answer in time, fails, or its program stops. At
-        the end, also after an error, the order is discarded and never written again.
+        If the connection is lost meanwhile, the order is written again at the first package of the
+        next one, unless the order is 10 s old by then or the controller was restarted: a robot must
+        not move when nobody expects it. The order INSERT also waits, within the same time, for the
+        end of a trace that has begun. It sets `last` to the insertion, or to None if none was
+        complete by then. Raise CellError if the robot does not answer in time, fails, or its
+        program stops.
         """
         self.recorder.arm()  # discards what was received between orders
         self._number = self._number % MAX_NUMBER + 1
-        self.last = None if verb is Verb.INSERT else self.last
-        self.recorder.stream.write({ORDER: encode_message(self._number, verb)})
+        is_insertion = verb is Verb.INSERT
+        if is_insertion:
+            self.last = None
+        order = {ORDER: encode_message(self._number, verb)}
+        self.recorder.stream.write(order)
+        repeat_until = time.monotonic() + REPEAT_S
         result: ResultCode | None = None
-        try:
-            for row in self.recorder.rows(self.order_timeout):
-                if verb is Verb.INSERT and self.last is None:
-                    self.last = self.recorder.feed(row)
-                result = result or self._find_result(row, verb)
-                is_recording = verb is Verb.INSERT and self.last is None and self.recorder.begun
-                if result and not is_recording:
-                    break
-        finally:
-            self.recorder.stream.write(None)
+        for row in self.recorder.stream.rows(self.order_timeout):
+            if row.timestamp < self._newest.timestamp:  # restarted: the order was meant for before
+                repeat_until = 0.0
+            elif row.session > self._newest.session and time.monotonic() < repeat_until:
+                self.recorder.stream.write(order)
+            self._newest = row
+            if is_insertion and self.last is None:
+                self.last = self.recorder.feed(row)
+            result = result or self._find_result(row, verb)
+            is_recording = is_insertion and self.last is None and self.recorder.begun
+            if result and not is_recording:
+                break
         if result is None:
             raise self._timeout_error(f"to answer order {self._number} ({verb.name.lower()})")
         return result
@@ -217,11 +227,12 @@ class UrCell(AbstractContextManager["UrCell"]):
         `expected` says what it had to do, like "to send its state". The message ends with why there
         is no connection, or with advice if there is one.
         """
-        stream = self.recorder.stream
         reason = "it did not; does its program do what ur_cell.script does, is it paused?"
-        if stream.trouble:
-            reason = f"there is no connection: {stream.trouble}"
-        return CellError(f"Expected the robot at {stream.where} {expected} in time, {reason}")
+        if trouble := self.recorder.stream.trouble:
+            reason = f"there is no connection: {trouble}"
+        return CellError(
+            f"Expected the robot at {self.recorder.where} {expected} in time, {reason}"
+        )
 
     def _find_result(self, row: Row, verb: Verb) -> ResultCode | None:
         """Return the result of the present order (`verb`) if the package `row` holds it, else None.
@@ -231,43 +242,37 @@ class UrCell(AbstractContextManager["UrCell"]):
         result.
         """
         number, code = divmod(int(row.values[ANSWER]), 10)
-        state = int(row.values[RUNTIME])
-        order = f"order {self._number} ({verb.name.lower()})"
         if number == self._number:
             if code in SUCCESSES.get(verb, (ResultCode.DONE,)):
                 return ResultCode(code)
-            failure = FAILURES.get(code, f"it answered {code}")
-            raise CellError(
-                f"Expected the robot to carry out {order}, {failure}; "
-                "look at the part, then begin again."
-            )
-        if state in (Runtime.STOPPING, Runtime.STOPPED):
-            raise CellError(
-                f"Expected the robot to carry out {order}, its program has stopped; "
-                "start it and begin again."
-            )
-        return None
+            failure = f"{FAILURES.get(code, f'it answered {code}')}; look at the part, then"
+        elif int(row.values[RUNTIME]) in (Runtime.STOPPING, Runtime.STOPPED):
+            failure = "its program has stopped; start it and"
+        else:
+            return None
+        order = f"order {self._number} ({verb.name.lower()})"
+        raise CellError(f"Expected the robot to carry out {order}, {failure} begin again.")
 
-    def _wait_until_ready(self) -> int:
-        """Wait until the robot's program runs and has answered its last order; return the number of
-        this order.
+    def _wait_until_ready(self) -> Row:
+        """Wait until the robot's program runs and has answered its last order; return the package
+        that shows it.
 
-        Packages that arrive meanwhile are discarded. The numbers of the order and of the result in
+        Packages that arrive before are discarded. The numbers of the order and of the result in
         the registers must be equal. Raise CellError after `start_timeout` seconds; its message says
         whether the robot sent nothing, its program does not run, or it has not answered.
         """
         problem = ""
-        for row in self.recorder.rows(self.start_timeout):
+        for row in self.recorder.stream.rows(self.start_timeout):
             ordered, answered, state = (int(row.values[name]) for name in (ORDER, ANSWER, RUNTIME))
-            if state == Runtime.PLAYING and ordered // 10 == answered // 10:
-                return ordered // 10
-            is_playing = state == Runtime.PLAYING
-            waiting = f"it owes an answer to order {ordered // 10}"
-            problem = waiting if is_playing else "its program does not run"
+            problem = f"it owes an answer to order {ordered // 10}"
+            if state != Runtime.PLAYING:
+                problem = "its program does not run"
+            elif ordered // 10 == answered // 10:
+                return row
         if not problem:
             raise self._timeout_error("to send its state")
         raise CellError(
-            f"Expected the robot at {self.recorder.stream.where} to be ready within "
+            f"Expected the robot at {self.recorder.where} to be ready within "
             f"{self.start_timeout:g} s, {problem}; start ur_cell.script of dengine/cells/ur, or "
             "your own program of its handshake, on it."
         )

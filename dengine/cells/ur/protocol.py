@@ -26,17 +26,17 @@ VERSION = 2
 HEADER = struct.Struct(">HB")
 NOT_FOUND = "NOT_FOUND"
 IN_USE = "IN_USE"
-TYPES = {  # by field type: the letter of `struct`, and the number of values
-    "BOOL": ("?", 1),
-    "UINT8": ("B", 1),
-    "UINT32": ("I", 1),
-    "UINT64": ("Q", 1),
-    "INT32": ("i", 1),
-    "DOUBLE": ("d", 1),
-    "VECTOR3D": ("d", 3),
-    "VECTOR6D": ("d", 6),
-    "VECTOR6INT32": ("i", 6),
-    "VECTOR6UINT32": ("I", 6),
+TYPES = {  # by field type: a letter of `struct` for each of its values
+    "BOOL": "?",
+    "UINT8": "B",
+    "UINT32": "I",
+    "UINT64": "Q",
+    "INT32": "i",
+    "DOUBLE": "d",
+    "VECTOR3D": "ddd",
+    "VECTOR6D": "dddddd",
+    "VECTOR6INT32": "iiiiii",
+    "VECTOR6UINT32": "IIIIII",
 }
 
 
@@ -112,9 +112,7 @@ class RtdeRecipe:
     @cached_property
     def layout(self) -> struct.Struct:
         """Binary layout of a data package: the recipe's number, then the values."""
-        return struct.Struct(
-            ">B" + "".join(n * letter for letter, n in map(TYPES.__getitem__, self.types))
-        )
+        return struct.Struct(">B" + "".join(TYPES[field_type] for field_type in self.types))
 
     @cached_property
     def columns(self) -> tuple[str, ...]:
@@ -122,7 +120,7 @@ class RtdeRecipe:
 
         It is like `timestamp`, or like `actual_TCP_force[2]` for an element of a vector.
         """
-        sizes = [TYPES[field_type][1] for field_type in self.types]
+        sizes = [len(TYPES[field_type]) for field_type in self.types]
         fields = zip(self.names, sizes, strict=True)
         return tuple(
             name if size == 1 else f"{name}[{i}]" for name, size in fields for i in range(size)
@@ -138,7 +136,7 @@ class RtdeRecipe:
         ValueError for NaN, and OverflowError for an infinity.
         """
         numbers = [
-            values.get(name, 0) if letter == "d" else int(values.get(name, 0))
+            (float if letter == "d" else int)(values.get(name, 0))
             for name, letter in zip(self.columns, self.layout.format[2:], strict=True)
         ]
         return Package(PackageType.DATA, self.layout.pack(self.number, *numbers)).to_bytes()
@@ -192,19 +190,16 @@ def read_recipe(payload: bytes, names: Sequence[str], direction: str) -> RtdeRec
     type_by_name = dict(zip(names, types, strict=True))
     unknown = [name for name, type_ in type_by_name.items() if type_ not in (*TYPES, IN_USE)]
     if unknown:
-        do = (
-            "name others, or update its software "
-            "(registers from 24 on: 3.9 / 5.3, ft_raw_wrench: 5.9)"
-        )
         raise CellError(
-            f"Expected {direction} fields that this controller has, "
-            f"it does not know {', '.join(unknown)}; {do}."
+            f"Expected {direction} fields that this controller has, it does not know "
+            f"{', '.join(unknown)}; name others, or update its software "
+            "(registers from 24 on: 3.9 / 5.3, ft_raw_wrench: 5.9)."
         )
     in_use = [name for name, type_ in type_by_name.items() if type_ == IN_USE]
     if in_use:
-        do = "close it, or its fieldbus unit (EtherNet/IP, PROFINET), or choose other registers"
         raise HeldError(
-            f"Expected to write {', '.join(in_use)}, another client of this controller does; {do}."
+            f"Expected to write {', '.join(in_use)}, another client of this controller does; close "
+            "it, or its fieldbus unit (EtherNet/IP, PROFINET), or choose other registers."
         )
     return RtdeRecipe(payload[0], tuple(names), types)
 

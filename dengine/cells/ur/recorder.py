@@ -8,10 +8,10 @@ with RtdeRecorder("192.168.1.10", trigger="bit=0") as recorder:
         decision = engine.decide(insertion.trace)
 """
 
-import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -19,7 +19,7 @@ from ...datasets.triggers import Start, StartFinder, Trigger, as_trigger, place
 from ...errors import CellError, expect
 from ...records import TraceArray, TraceSpec
 from .protocol import CHANNELS, PORT
-from .stream import Row, RtdeStream, StreamReport
+from .stream import Row, RtdeClient, RtdeStream, StreamReport
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,15 +32,12 @@ class InsertionRecord:
         NaN for samples that were lost.
     missing : int
         Number of lost samples; all of them if the start was lost, since no time is known then.
-    repeated : int
-        Samples that came twice, of which the first counts.
     reconnects : int
         Reconnections during the insertion.
     """
 
     trace: TraceArray
     missing: int
-    repeated: int
     reconnects: int
 
 
@@ -113,14 +110,14 @@ class RtdeRecorder(AbstractContextManager["RtdeRecorder"]):
         self._signals = {name: CHANNELS.get(name, name) for name in self.trigger.signals}
         self.spec = spec_of_recording(samples, self.channels, rate_hz)
         self._before = before
-        self.stream = RtdeStream(
-            host, (*self._columns, *self._signals.values(), *also), inputs, rate_hz, port, timeout
-        )
+        self.where = f"{host}:{port}"
+        values = (*self._columns, *self._signals.values(), *also)
+        connect = partial(RtdeClient, host, port, values, inputs, rate_hz, timeout)
+        self.stream = RtdeStream(connect, rate_hz)
         self._step = self.stream.step
         self._finder = StartFinder(self._step, self.trigger.quiet_s)
         self._rows: list[Row] = []
         self._start: Start | None = None
-        self._armed: int | None = None  # number of connections when `arm` was called
 
     def close(self) -> None:
         """Close the connection and end its thread."""
@@ -132,7 +129,7 @@ class RtdeRecorder(AbstractContextManager["RtdeRecorder"]):
     def arm(self) -> None:
         """Discard what was received so far, begun or not; record what begins from now on."""
         self._reset()
-        self._armed = self.stream.clear()
+        self.stream.clear()
 
     def report(self) -> StreamReport:
         """Return the counts of all packages since the connection was opened."""
@@ -159,34 +156,15 @@ class RtdeRecorder(AbstractContextManager["RtdeRecorder"]):
         CellError
             If no insertion begins within `timeout`.
         """
-        for row in self.rows(timeout):
+        for row in self.stream.rows(timeout):
             if (record := self.feed(row)) is not None:
                 return record
         if self.begun:
             return self.cut()
-        trouble = self.stream.trouble
-        why = (
-            f"there is no connection: {trouble}"
-            if trouble
-            else f"the trigger never went on: {self.trigger}"
-        )
-        raise CellError(
-            f"Expected an insertion at {self.stream.where} within {timeout:g} s, {why}."
-        )
-
-    def rows(self, seconds: float) -> Iterator[Row]:
-        """Yield the packages of the robot, each removed from the buffer, for this many seconds.
-
-        Packages that are buffered already come first. The time runs from the first call of `next`
-        on the iterator. If the stream is closed, the iteration ends when the buffer is empty or the
-        time is over.
-        """
-        end = time.monotonic() + seconds
-        while (left := end - time.monotonic()) > 0:
-            row = self.stream.take(left)
-            if row is None:  # the time is over, or the stream closed
-                return
-            yield row
+        why = f"the trigger never went on: {self.trigger}"
+        if self.stream.trouble:
+            why = f"there is no connection: {self.stream.trouble}"
+        raise CellError(f"Expected an insertion at {self.where} within {timeout:g} s, {why}.")
 
     @property
     def begun(self) -> bool:
@@ -226,26 +204,22 @@ class RtdeRecorder(AbstractContextManager["RtdeRecorder"]):
 
         Samples that did not come are NaN. All samples are NaN if packages are missing where the
         insertion began, so that its start is unknown, or if no insertion has begun. The recorder
-        then looks for the next one, and what `arm` noted is discarded, too.
+        then looks for the next one.
         """
         start = self._start
         first = self._first_time()
         rows = self._rows
-        armed = self._armed
         self._reset()
-        reconnects = (
-            0 if start is None else rows[-1].session - (rows[0].session if armed is None else armed)
-        )
+        reconnects = 0 if start is None else rows[-1].session - rows[0].session
         rows = rows if start is not None and start.seen else []
         values = np.array(
             [[row.values[c] for c in self._columns] for row in rows], dtype=np.float64
         )
         values = values.reshape(len(rows), len(self._columns))
-        placed = place(
-            [row.timestamp for row in rows], values, first, self.spec.samples, self._step
-        )
-        trace = placed.trace[0] if len(self._columns) == 1 else placed.trace
-        return InsertionRecord(trace, len(placed.missing), placed.repeated, reconnects)
+        times = [row.timestamp for row in rows]
+        trace, n_missing = place(times, values, first, self.spec.samples, self._step)
+        trace = trace[0] if len(self._columns) == 1 else trace
+        return InsertionRecord(trace, n_missing, reconnects)
 
     def _first_time(self) -> float:
         """Return the time of the trace's first sample, in seconds of the controller's clock.
@@ -255,11 +229,7 @@ class RtdeRecorder(AbstractContextManager["RtdeRecorder"]):
         return float("nan") if self._start is None else self._start.time - self._before * self._step
 
     def _reset(self) -> None:
-        """Discard the packages and the start of an insertion that has begun, and look for the next.
-
-        The number of connections that `arm` noted is discarded, too.
-        """
+        """Discard the packages and the start of an insertion that has begun; look for the next."""
         self._finder.forget()
         self._rows = []
         self._start = None
-        self._armed = None

@@ -1,7 +1,7 @@
 """`RtdeStream`, which receives all packages of a controller in a thread, and reconnects.
 `RtdeClient` is one connection; the stream makes a new one when it is lost, buffers the packages as
-`Row`s, writes inputs, and counts what was missing in a `StreamReport`. `RtdeRecorder` reads from
-it.
+`Row`s, and counts what was missing in a `StreamReport`. `RtdeRecorder` reads from it, and `UrCell`
+writes inputs through it.
 """
 
 import socket
@@ -10,9 +10,8 @@ import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, suppress
+from contextlib import suppress
 from dataclasses import dataclass
-from functools import partial
 from itertools import chain
 
 from ...errors import CellError, SettingError, instead
@@ -85,9 +84,11 @@ class RtdeClient:
                     f"Expected RTDE protocol version {VERSION} at {self.where}, "
                     "which refuses it; update it."
                 )
-            named = struct.pack(">d", rate_hz) + ",".join(outputs).encode()
+            rate = struct.pack(">d", rate_hz)
             self._outputs = read_recipe(
-                self._request(PackageType.OUTPUTS, named), outputs, "output"
+                self._request(PackageType.OUTPUTS, rate + ",".join(outputs).encode()),
+                outputs,
+                "output",
             )
             if unknown := ", ".join(set(columns) - {*self._outputs.columns}):
                 raise SettingError(
@@ -164,19 +165,16 @@ class RtdeClient:
         """
         packages = PackageReader()
         while True:
+            piece = b""
+            reason = "it hung up"
             try:
                 piece = self._socket.recv(RECEIVE_BYTES)
+            except TimeoutError:
+                reason = f"it was silent for {self._socket.gettimeout():g} s"
             except OSError as error:
                 reason = f"the connection is lost: {error}"
-                if isinstance(error, TimeoutError):
-                    reason = f"it was silent for {self._socket.gettimeout():g} s"
-                raise CellError(
-                    f"Expected packages from {self.where}, {reason}{self._last_text}."
-                ) from error
             if not piece:
-                raise CellError(
-                    f"Expected packages from {self.where}, it hung up{self._last_text}."
-                )
+                raise CellError(f"Expected packages from {self.where}, {reason}{self._last_text}.")
             for package in packages.feed(piece):
                 if package.type is PackageType.TEXT:
                     text = package.payload[1 : 1 + package.payload[0]].decode("utf-8", "replace")
@@ -186,7 +184,6 @@ class RtdeClient:
 
 
 BUFFER_S = 60.0  # of packages that nobody has taken; older ones are lost
-REPEAT_S = 10.0  # an input is written again after a reconnection if it is at most this old
 RELEASE_S = 2.0  # within which a controller notices that an earlier client has gone
 RETRY_S = (0.05, 1.0)  # between attempts to connect: the shortest and the longest
 
@@ -232,15 +229,20 @@ class StreamReport:
     incomplete: int = 0
 
 
-class RtdeStream(AbstractContextManager["RtdeStream"]):
-    """Receives packages in a thread and buffers them for `take`.
+class RtdeStream:
+    """Receives packages in a thread and buffers them for `rows`.
 
-    The parameters are those of `RtdeClient`, and `clock`, a function that returns seconds. If the
-    first connection fails, CellError is raised, or SettingError for an unknown column; if another
-    client still writes an input, only after further attempts for 2 s. If a connection is lost
-    later, the thread reconnects, with as many attempts as that takes. It then writes the newest
-    inputs again, unless they are old or the controller was restarted. The buffer holds 60 s of
+    If the first connection fails, CellError is raised, or SettingError for an unknown column; if
+    another client still writes an input, only after further attempts for 2 s. If a connection is
+    lost later, the thread reconnects, with as many attempts as that takes. The buffer holds 60 s of
     packages; older packages are dropped.
+
+    Parameters
+    ----------
+    connect : callable
+        Returns a new `RtdeClient`, or raises its errors.
+    rate_hz : float
+        Packages per second, as the client requests them.
 
     Attributes
     ----------
@@ -248,36 +250,18 @@ class RtdeStream(AbstractContextManager["RtdeStream"]):
         Why there is no connection at present; "" if there is one.
     """
 
-    def __init__(
-        self,
-        host: str,
-        columns: Sequence[str] = (),
-        inputs: Sequence[str] = (),
-        rate_hz: float = 500.0,
-        port: int = PORT,
-        timeout: float = 2.0,
-        clock: Callable[[], float] = time.monotonic,
-    ) -> None:
+    def __init__(self, connect: Callable[[], RtdeClient], rate_hz: float) -> None:
         self.step = 1.0 / rate_hz
-        self.where = f"{host}:{port}"
         self.trouble = ""
-        self._open = partial(RtdeClient, host, port, columns, inputs, rate_hz, timeout)
-        self._clock = clock
+        self._open = connect
         self._rows = deque[Row](maxlen=int(BUFFER_S * rate_hz))  # not taken yet
         self._news = threading.Condition()
         self._newest: Row | None = None
-        self._written: Values | None = None
-        self._written_at = 0.0
         self._session = 0  # number of earlier connections
-        self._must_repeat = (
-            False  # whether this connection must still write the newest inputs again
-        )
         self._counts = Counter[str]()
         self._closing = threading.Event()
         self._client = self._connect(time.monotonic() + RELEASE_S)
-        self._thread = threading.Thread(
-            target=self._read_loop, name=f"rtde {self.where}", daemon=True
-        )
+        self._thread = threading.Thread(target=self._read_loop, name="rtde", daemon=True)
         self._thread.start()
 
     def close(self) -> None:
@@ -290,71 +274,51 @@ class RtdeStream(AbstractContextManager["RtdeStream"]):
             client.close()
         self._thread.join()
 
-    def __exit__(self, *raised: object) -> None:
-        self.close()
-
     def report(self) -> StreamReport:
         """Return the counts so far; `incomplete` is 0, which a `UrCell` fills in."""
         with self._news:
             return StreamReport(**self._counts)
 
-    def take(self, timeout: float) -> Row | None:
-        """Remove and return the oldest buffered package.
+    def rows(self, seconds: float) -> Iterator[Row]:
+        """Yield the packages of the robot, each removed from the buffer, for this many seconds.
 
-        If the buffer is empty, it waits up to `timeout` seconds for a package, and no longer once
-        the stream is closed. It returns None if no package came.
+        Packages that are buffered already come first. The time runs from the first call of `next`
+        on the iterator. If the stream is closed, the iteration ends when the buffer is empty or the
+        time is over.
         """
-        with self._news:
-            self._news.wait_for(lambda: self._rows or self._closing.is_set(), timeout)
-            return self._rows.popleft() if self._rows else None
+        end = time.monotonic() + seconds
+        while (left := end - time.monotonic()) > 0:
+            with self._news:
+                self._news.wait_for(lambda: self._rows or self._closing.is_set(), left)
+                if not self._rows:  # the time is over, or the stream closed
+                    return
+                row = self._rows.popleft()
+            yield row
 
-    def clear(self) -> int:
-        """Discard the buffered packages; return the number of reconnections so far."""
+    def clear(self) -> None:
+        """Discard the buffered packages."""
         with self._news:
             self._rows.clear()
-            return self._session
 
-    def write(self, values: Values | None) -> None:
-        """Write inputs of the controller now, or once there is a connection again.
+    def write(self, values: Values) -> None:
+        """Write inputs of the controller; without a connection nothing is written or raised.
 
-        All input fields that the stream was opened with are written: those that are left out become
-        0, and other names are ignored. A lost connection raises nothing: the newest inputs are
-        written again on the next connection, unless they are 10 s old by then or the controller was
-        restarted. While there is a connection, raises struct.error for a number that its field
-        cannot hold, and in an integer field ValueError for NaN and OverflowError for an infinity.
-        Such values stay the newest inputs all the same: if they are written again on a new
-        connection, they end the thread that receives packages.
-
-        Parameters
-        ----------
-        values : mapping of str to float, or None
-            By the name of the value, such as `input_int_register_24`. None writes nothing, and
-            discards the newest inputs.
+        All input fields of the client are written: those that are left out become 0, and other
+        names are ignored. A connection may be lost unnoticed, so write again what must arrive when
+        a package of a later connection comes (`Row.session`). `values` are numbers by the name of
+        the value, such as `input_int_register_24`. While there is a connection, raises the errors
+        of `RtdeRecipe.pack` for a number that its field cannot hold.
         """
-        with self._news:
-            self._written = values
-            self._written_at = self._clock()
-            self._send()
-
-    def _send(self) -> None:
-        """Write the newest inputs to the controller; do nothing without inputs or a connection.
-
-        The caller holds the lock `_news`. A lost connection is noted in the attribute `trouble` and
-        not raised: the thread reconnects and writes the inputs again, unless they are 10 s old by
-        then. Raises the errors of `RtdeRecipe.pack`.
-        """
-        if self._client is not None and self._written is not None:
-            try:
-                self._client.send(self._written)
-            except CellError as error:  # the reading thread reconnects and writes them again
-                self.trouble = str(error)
+        with self._news, suppress(CellError):  # the reading thread reconnects
+            if self._client is not None:
+                self._client.send(values)
 
     def _read_loop(self) -> None:
         """Receive packages and buffer them until the stream is closed: the body of the thread.
 
         If the connection is lost, or its bytes are no RTDE, it reconnects, as often as that takes,
-        and counts each new connection. An input that cannot be packed (`RtdeRecipe.pack`) ends the
-        thread. While there is no connection, the attribute `trouble` says why.
+        and counts each new connection. While there is no connection, the attribute `trouble` says
+        why.
         """
         while self._client is not None:
             client = self._client
@@ -371,21 +335,19 @@ class RtdeStream(AbstractContextManager["RtdeStream"]):
                 self._client = new_client
                 if new_client is not None:
                     self.trouble = ""
-                    self._must_repeat = True
                     self._session += 1
                     self._counts["reconnects"] += 1
                     if self._closing.is_set():  # `close` did not see this client
                         new_client.close()
 
     def _count_and_buffer(self, row: Row) -> None:
-        """Count a package and the packages missing before it, buffer it, and wake callers of
-        `take`.
+        """Count a package and the packages missing before it, buffer it, and wake who waits in
+        `rows`.
 
         `row` is the package. Times are compared in whole steps of 1 / rate, rounded. One with the
         same time as the package before is counted as repeated; one with an earlier time shows that
-        the controller was restarted, which is counted, and the newest inputs are discarded. If the
-        buffer is full, its oldest package is dropped. At the first package of a new connection the
-        newest inputs, if they were not discarded, are written again if they are less than 10 s old.
+        the controller was restarted, which is counted. If the buffer is full, its oldest package is
+        dropped.
         """
         with self._news:
             if self._newest is not None:
@@ -393,14 +355,9 @@ class RtdeStream(AbstractContextManager["RtdeStream"]):
                 self._counts["missing"] += max(steps - 1, 0)
                 self._counts["repeated"] += steps == 0
                 self._counts["restarts"] += steps < 0
-                if steps < 0:  # the controller was restarted: the inputs were meant for before
-                    self._written = None
             self._counts["packages"] += 1
             self._newest = row
             self._rows.append(row)
-            if self._must_repeat and self._clock() - self._written_at < REPEAT_S:
-                self._send()
-            self._must_repeat = False
             self._news.notify_all()
 
     def _connect(self, until: float = float("inf")) -> RtdeClient | None:
