@@ -8,8 +8,7 @@ app = create_app(CellService(lambda: DataEngine.open_or_create("cell.db"), "cell
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator, Callable, Sequence
-from contextlib import AbstractAsyncContextManager, AsyncExitStack, asynccontextmanager
+from collections.abc import AsyncIterator, Callable
 from dataclasses import replace
 from functools import cached_property
 from itertools import islice
@@ -19,6 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 from msgspec import Meta
 from starlette.applications import Starlette
+from starlette.exceptions import HTTPException
 from starlette.middleware import Middleware
 from starlette.requests import Request
 from starlette.responses import FileResponse, Response, StreamingResponse
@@ -29,15 +29,14 @@ from .. import __version__
 from ..decision.policy import Policy
 from ..engine.corrections import Changed
 from ..engine.engine import DataEngine
-from ..errors import expect
 from ..history.explain import explain, find_decision_id
 from ..history.map import part_map
-from ..history.status import NEWEST, iterate_decisions, read_course
+from ..history.status import iterate_decisions, read_course
 from ..records import Action, is_name
 from ..store.records import StoredDecision, unknown_decision
 from ..store.views import HistoryFilter
 from . import api
-from .api import Json, Operation, Refusal, field_types, response_fields
+from .api import Json, Operation, field_types, response_fields
 from .auth import CURRENT_TOKEN, Guard, Token
 from .metrics import Metrics
 from .service import CellService
@@ -55,8 +54,6 @@ N_LABELS = 200  # newest labels among which they are looked for
 STATIC = Path(__file__).parent / "page" / "static"
 # All are index.html, whose script shows the view of the URL.
 VIEWS = ("/", "/overview", "/map", "/part", "/history", "/actions")
-MIN_SHIFT_HOURS = 0.0003
-Beside = Callable[[CellService], AbstractAsyncContextManager[object]]
 
 # Types of requests' fields
 Id = Annotated[str, Meta(description="Of the decision.")]
@@ -75,8 +72,8 @@ Author = Annotated[
 ]
 Limit = Annotated[int, Meta(ge=1, le=200, description="How many at most.")]
 ShiftHours = Annotated[
-    float,
-    Meta(ge=0.0, le=1e7, description="Length of a shift, which is then a stretch; 0: no shifts."),
+    int,
+    Meta(ge=0, le=10**7, description="Length of a shift, which is then a stretch; 0: no shifts."),
 ]
 ShiftStart = Annotated[
     float, Meta(ge=0.0, le=1e7, description="When a shift begins, in hours since 1970.")
@@ -101,30 +98,15 @@ class HttpApi:
 
     @cached_property
     def operations(self) -> list[Operation]:
-        """The `Operation` of every path and method: its handler, the type of its response, and
-        examples; cached.
+        """The `Operation` of every path and method: its handler, and the type of its response;
+        cached.
         """
-        one_channel: Json = {
-            "trace": [0.1, 1.5, 2.25, None, 0.4],
-            "request": "order-7",
-            "part": "P-1007",
-        }
-        two_channels: Json = {"trace": [[0.1, 1.5, 2.25], [0.0, 0.2, 0.1]]}
-        good: Json = {"id": "order-7", "success": True}
-        bad: Json = {"part": "P-1007", "success": False, "author": "Kim"}
         # A guarantee may name a class, and no request over the network may cause an import.
         policy = field_types(Policy, "guarantee") | {"force_limits": list[str]}
         filter_ = field_types(HistoryFilter, "label")
         return [
-            Operation(
-                "POST",
-                "/decide",
-                self.decide,
-                "DecideResponse",
-                raw_parameter="trace",
-                examples=(one_channel, two_channels),
-            ),
-            Operation("POST", "/report", self.report, "ReportResponse", examples=(good, bad)),
+            Operation("POST", "/decide", self.decide, "DecideResponse", raw_parameter="trace"),
+            Operation("POST", "/report", self.report, "ReportResponse"),
             Operation("POST", "/correct", self.correct, "Changed"),
             Operation("POST", "/forget", self.forget, "Changed"),
             Operation("POST", "/rollback", self.rollback, "Changed"),
@@ -212,14 +194,16 @@ class HttpApi:
     async def _find_id(self, id_: str, part: str) -> str:
         """Return the id of a decision, given by its id or by its part's number.
 
-        Raises Refusal 422 for both or neither, UnknownDecisionError for a part without a decision,
-        and ReportConflictError for a part with several (rejects count only if there is nothing
-        else). A decision's id in place of the part's number is found, too. For a part it waits in
-        the queue, and raises BusyError if that is full or the service is closing, and StoreError.
-        An id is not looked up.
+        Raises HTTPException 422 for both or neither, UnknownDecisionError for a part without a
+        decision, and ReportConflictError for a part with several (rejects count only if there is
+        nothing else). A decision's id in place of the part's number is found, too. For a part it
+        waits in the queue, and raises BusyError if that is full or the service is closing, and
+        StoreError. An id is not looked up.
         """
         if bool(id_) == bool(part):
-            raise Refusal(422, "Expected the id of a decision, or the part's number in its place.")
+            raise HTTPException(
+                422, "Expected the id of a decision, or the part's number in its place."
+            )
         return id_ or await self.service.read(lambda store: find_decision_id(store, part))
 
     async def correct(
@@ -335,20 +319,16 @@ class HttpApi:
 
     async def status(
         self,
-        last: Annotated[
-            int,
-            Meta(ge=1, le=100_000, description="Number of newest decisions counted as `newest`."),
-        ] = NEWEST,
         watch: Annotated[
             bool, Meta(description="Include the state of the safe mode's detectors.")
         ] = False,
     ) -> Json:
         """Return how the cell is doing: counts of decisions, version, faults, queue and alarm.
 
-        The counts are of all decisions, and of the newest `last`. 503: the queue is full, or the
-        store cannot be read.
+        The counts are of all decisions, and of the newest 500. 503: the queue is full, or the store
+        cannot be read.
         """
-        status = await self.service.status(last, watch)
+        status = await self.service.status(watch)
         line = {name: getattr(self.service, name) for name in api.LINE}
         texts = {"alarm": status.alarm, "claim": status.certificate.sentence}
         return response_fields("Status", status, **texts, **line)
@@ -407,21 +387,15 @@ class HttpApi:
         """
         return await self.service.read(lambda store: _read_explanation(store, id_))
 
-    async def course(self, hours: ShiftHours = 0.0, start: ShiftStart = 0.0) -> Json:
+    async def course(self, hours: ShiftHours = 0, start: ShiftStart = 0.0) -> Json:
         """Return counts of the decisions in stretches, oldest first, with retrains and safe modes.
 
         A stretch is a number of decisions that are counted together. With `hours` a stretch is a
         shift of this length, and `start` is when one of the shifts begins. Without it all decisions
         are split into at most 120 stretches of at least 20 decisions; the newest stretch may have
         fewer. At most the newest 120 stretches with decisions are returned, but all retrains and
-        safe modes of the cell. 422: `hours` is not 0 and below 0.0003, about a second; 503: the
-        queue is full, or the store cannot be read.
+        safe modes of the cell. 503: the queue is full, or the store cannot be read.
         """
-        expect(
-            hours == 0.0 or hours >= MIN_SHIFT_HOURS,
-            f"hours of 0, or of {MIN_SHIFT_HOURS} or more, a second",
-            hours,
-        )
         recipe = self.service.engine.recipe
         by = {"seconds": 3600.0 * hours, "start": 3600.0 * start}
         course = await self.service.read(lambda store: read_course(store, recipe, N_LABELS, **by))
@@ -520,7 +494,7 @@ class HttpApi:
         """Call `work` in the engine's thread with the engine and the author, and return its
         `Changed`.
 
-        The result is in the form of the response. Raises Refusal for an author that
+        The result is in the form of the response. Raises HTTPException for an author that
         `_checked_author` does not take, BusyError if the queue is full or the service is closing,
         and what `work` raises.
         """
@@ -533,16 +507,18 @@ def _checked_author(author: str) -> str:
     """Return the author for the event log: the name of the token that the present request has
     (`CURRENT_TOKEN`), or the given name if this token has none.
 
-    In the given name each run of white space becomes a single space. Raises Refusal 422 if there is
-    no name, if the name is longer than 200 characters or not printable, and if both names are given
-    and differ.
+    In the given name each run of white space becomes a single space. Raises HTTPException 422 if
+    there is no name, if the name is longer than 200 characters or not printable, and if both names
+    are given and differ.
     """
     owner = CURRENT_TOKEN.get().name
     name = " ".join(author.split())
     if owner and name not in ("", owner):
-        raise Refusal(422, f"Expected author to be {owner}, whose token it is, or to be left out.")
+        raise HTTPException(
+            422, f"Expected author to be {owner}, whose token it is, or to be left out."
+        )
     if not is_name(owner or name):
-        raise Refusal(422, "Expected author, the name of who asks for it, for the event log.")
+        raise HTTPException(422, "Expected author, the name of who asks for it, for the event log.")
     return owner or name
 
 
@@ -594,7 +570,6 @@ def create_app(
     service: CellService,
     tokens: tuple[Token, ...] = (),
     *,
-    beside: Sequence[Beside] = (),
     recorder: RtdeRecorder | None = None,
 ) -> Starlette:
     """Create the application. The caller closes the service after it has ended.
@@ -607,10 +582,6 @@ def create_app(
     tokens : tuple of Token, optional
         Empty: no request needs a token. Serve the application at a loopback address alone then;
         this is not checked here.
-    beside : sequence of callable
-        Each is called with the service and returns an async context, which lasts as long as the
-        application, in the same event loop: an OPC UA server, for example. One that fails to start
-        ends the application; its error is `app.state.failure`.
     recorder : RtdeRecorder, optional
         Records the traces for `decide_recorded`; the caller closes it.
 
@@ -626,26 +597,8 @@ def create_app(
     routes += [Route(path, _index_page) for path in VIEWS]
     routes.append(Mount("/page/static", StaticFiles(directory=STATIC)))
 
-    @asynccontextmanager
-    async def lifespan(app: Starlette) -> AsyncIterator[None]:
-        """Enter what `beside` returns, and leave it when the application ends.
-
-        If a start fails, what was entered is left, and the error is kept in `app.state.failure` and
-        raised.
-        """
-        async with AsyncExitStack() as stack:
-            try:
-                for start in beside:
-                    await stack.enter_async_context(start(service))
-            except Exception as error:
-                app.state.failure = error  # uvicorn says only that it did not start
-                raise
-            yield
-
     guard = Middleware(Guard, tokens=tokens)
-    app = Starlette(
-        routes=routes, middleware=[guard], exception_handlers=api.HANDLERS, lifespan=lifespan
-    )
+    app = Starlette(routes=routes, middleware=[guard], exception_handlers=api.HANDLERS)
     # A robot does not follow redirects, whose target a request's Host would determine.
     app.router.redirect_slashes = False
     return app

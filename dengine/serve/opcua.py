@@ -11,10 +11,9 @@ most twice a second. The begin and the end of an alarm are events of the Server 
 """
 
 import asyncio
-import hmac
 import logging
 import os
-from collections.abc import AsyncIterator, Awaitable, Callable, Collection, Mapping
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 from contextlib import asynccontextmanager, suppress
 from functools import wraps
 from pathlib import Path
@@ -31,9 +30,9 @@ from asyncua.server.user_managers import UserManager
 from asyncua.ua import VariantType
 from asyncua.ua.status_codes import StatusCodes
 
-from ..errors import DengineError, SettingError, TraceError, as_options, instead, log
+from ..errors import DengineError, SettingError, TraceError, as_options, log
 from ..files import FilePath
-from .auth import host_in_url, is_loopback
+from .auth import Token, check_key_pair, find_token, host_in_url, is_loopback
 from .robot_calls import RobotCalls, one_line
 from .service import CellService
 
@@ -71,17 +70,19 @@ STATUS_NAMES = {
 class TokenUsers(UserManager):
     """Who may read and call: the user `dengine` with a token as the password. Nobody administers.
 
+    A viewer's token is no password: whoever may read over OPC UA may also call.
+
     Parameters
     ----------
-    tokens : collection of str or None
-        None: everybody.
+    tokens : tuple of Token
+        Empty: everybody.
     encrypted : bool
         Whether clients without a certificate are refused; every client that encrypts has one.
         asyncua lets anyone open a channel without security, to ask for the endpoints, and would
         accept a session on it.
     """
 
-    def __init__(self, tokens: Collection[str] | None, encrypted: bool = False) -> None:
+    def __init__(self, tokens: tuple[Token, ...], encrypted: bool) -> None:
         self._tokens = tokens
         self._encrypted = encrypted
 
@@ -94,40 +95,19 @@ class TokenUsers(UserManager):
     ) -> User | None:
         """Return the user of a new session, who may read and call; or None to refuse the session.
 
-        The password is the token. A session is refused if the server encrypts and the client has no
-        certificate, or if the server has tokens and the user name or the token is wrong. `iserver`
-        is not used, and the content of the certificate is not checked.
+        The password is the token, a text. A session is refused if the server encrypts and the
+        client has no certificate, or if the server has tokens and the user name or the token is
+        wrong, or the token is a viewer's. `iserver` is not used, and the content of the certificate
+        is not checked.
         """
         if self._encrypted and not certificate:
             return None
-        if self._tokens is None:
+        if not self._tokens:
             return User(role=UserRole.User, name="anyone")
-        if isinstance(password, bytes):
-            secret = password
-        else:
-            secret = str(password or "").encode("utf-8", "surrogateescape")
-        # All are compared, so that the time does not show which one matches.
-        matches = sum(hmac.compare_digest(secret, token.encode()) for token in self._tokens)
-        if matches and username == USER:
+        token = find_token(self._tokens, password or "")
+        if token is not None and token.operates and username == USER:
             return User(role=UserRole.User, name=USER)
         return None
-
-
-async def _load_identity(server: Server, cert: FilePath, key: FilePath) -> None:
-    """Load the server's certificate and key, both in PEM.
-
-    Raises SettingError if a file cannot be read, holds no such thing, or needs a password.
-    """
-    with instead(
-        SettingError,
-        f"Cannot use {cert} and {key} for OPC UA",
-        OSError,
-        ValueError,
-        TypeError,
-        do="use PEM files, and a key without a password",
-    ):
-        await server.load_certificate(os.fspath(cert), "pem")
-        await server.load_private_key(os.fspath(key), format="pem")
 
 
 @asynccontextmanager
@@ -135,7 +115,7 @@ async def opcua_server(
     service: CellService,
     port: int = PORT,
     host: str = "127.0.0.1",
-    tokens: Collection[str] | None = None,
+    tokens: tuple[Token, ...] = (),
     cert: FilePath | None = None,
     key: FilePath | None = None,
 ) -> AsyncIterator[Server]:
@@ -149,8 +129,8 @@ async def opcua_server(
     port : int
         0: any free port; `server.bserver.port` of the yielded server then says which.
     host : str
-    tokens : collection of str, optional
-        Passwords of the user `dengine`; None: everybody may read and call.
+    tokens : tuple of Token, optional
+        Those of operators are passwords of the user `dengine`. Empty: everybody may read and call.
     cert, key : path, optional
         Files in PEM. With them the server speaks only Basic256Sha256, signed and encrypted; without
         them it encrypts nothing.
@@ -164,19 +144,16 @@ async def opcua_server(
     ------
     SettingError
         For an address that other machines can reach, unless there are tokens, a certificate and a
-        key; for a certificate without its key, or a key alone; for a file that cannot be read, or
-        that holds no certificate, or no key without a password.
+        key; and for a certificate and a key that `check_key_pair` refuses.
     OSError
         For a port in use.
     """
-    if (cert is None) != (key is None):
-        raise SettingError("Expected a certificate and its key together, got one of them.")
-    is_secure = cert is not None
-    if not (is_loopback(host) or (is_secure and tokens)):
+    if not (is_loopback(host) or (cert is not None and tokens)):
         raise SettingError(
             f"Expected a token, a certificate and a key to serve OPC UA on {host}; or stay on "
             "127.0.0.1."
         )
+    is_secure = check_key_pair(cert, key)
     # asyncua logs tracebacks of whatever strangers send.
     logging.getLogger("asyncua").setLevel(logging.CRITICAL)
     server = Server(user_manager=TokenUsers(tokens, is_secure))
@@ -184,20 +161,19 @@ async def opcua_server(
     server.limits.max_chunk_count = MAX_MESSAGE // CHUNK + 1
     server.iserver.max_connections = MAX_CONNECTIONS
     server.iserver.max_subscriptions = MAX_SUBSCRIPTIONS
-    identity = ua.AnonymousIdentityToken if tokens is None else ua.UserNameIdentityToken
+    identity = ua.UserNameIdentityToken if tokens else ua.AnonymousIdentityToken
     server.set_identity_tokens([identity])
     await server.init()
     server.allow_remote_admin(False)
     server.set_endpoint(f"opc.tcp://{host_in_url(host)}:{port}/dengine")
     server.set_server_name("dengine")
     await server.set_application_uri("urn:dengine:server")
-    if is_secure:
-        policy = ua.SecurityPolicyType.Basic256Sha256_SignAndEncrypt
-    else:
-        policy = ua.SecurityPolicyType.NoSecurity
-    server.set_security_policy([policy])
+    policy = ua.SecurityPolicyType.NoSecurity
     if cert is not None and key is not None:
-        await _load_identity(server, cert, key)
+        policy = ua.SecurityPolicyType.Basic256Sha256_SignAndEncrypt
+        await server.load_certificate(os.fspath(cert), "pem")
+        await server.load_private_key(os.fspath(key), format="pem")
+    server.set_security_policy([policy])
     space = AddressSpace(server, service)
     await space.build()
     async with server:

@@ -29,7 +29,7 @@ from numpy.typing import ArrayLike
 from ..engine.engine import DataEngine
 from ..errors import BusyError, NotTakenError, ReportConflictError, log
 from ..files import FilePath
-from ..history.status import NEWEST, Status, status
+from ..history.status import Status, status
 from ..records import Decision, PartNumber, Reason, RetrainReport, as_id, as_success
 from ..store.opening import open_store
 from ..store.records import StoredDecision
@@ -296,17 +296,21 @@ class CellService:
             once more. A new label with an author is recorded as an event. Raises the errors of
             `CellService.report`.
             """
-            stored = engine.find(decision_id)
-            if stored is not None and stored.success is label:
+
+            def has_label() -> bool:
+                """Return whether the decision has the reported label already."""
+                stored = engine.find(decision_id)
+                return stored is not None and stored.success is label
+
+            if has_label():
                 return True, None
             try:
                 retrain = engine.report(decision_id, label)
             except ReportConflictError:
                 engine.flush()  # a confirmation by the next decision may not have been on disk yet
-                stored = engine.find(decision_id)
-                if stored is None or stored.success is not label:
-                    raise
-                return True, None
+                if has_label():
+                    return True, None
+                raise
             if author:
                 engine.store.events.put(
                     "report",
@@ -364,14 +368,14 @@ class CellService:
             return await self.call(lambda engine: work(engine.store), read_only=True)
         return await asyncio.to_thread(work, self.read_store)
 
-    async def status(self, last: int = NEWEST, watching: bool = False) -> Status:
+    async def status(self, watching: bool = False) -> Status:
         """Return the status that `DataEngine.status` returns, but read the store like `read`.
 
-        `last` and `watching` are the arguments of `DataEngine.status`. Raises BusyError if the
+        `watching` is the argument of `DataEngine.status`. Raises BusyError if the
         queue is full or the service is closing, StoreError if the store cannot be read, and
         SettingError for a stored recipe that cannot be read.
         """
-        stored = await self.read(lambda store: status(store, last, watching))
+        stored = await self.read(lambda store: status(store, watching=watching))
         return self.engine.state.complete(stored)
 
     @property

@@ -147,7 +147,7 @@ def test_a_label_is_taken_once_and_not_against_itself(client, stream):
 
 
 LOOKS = """
-status?watch=true&last=7         Status
+status?watch=true                Status
 healthz                          Health
 decisions?limit=3                Decisions
 decisions/missing%2Fsample%20%3F Decision
@@ -158,7 +158,7 @@ versions                         Versions
 me                               Me
 events?limit=3                   Events
 """
-WRONG_LOOKS = """events?limit=0 status?last=0 course?hours=5e-324 decisions?limit=0 decisions?limit=x
+WRONG_LOOKS = """events?limit=0 status?watch=2 course?hours=5e-324 decisions?limit=0 decisions?limit=x
 decisions?open=yes decisions?label=fine decisions?since=monday decisions?limit=9999"""
 
 
@@ -268,7 +268,7 @@ def test_the_page_is_files_that_may_ask_nobody_else(client):
         assert client.get(unknown).status_code == 404
 
 
-def test_the_document_names_every_route_and_every_example_is_served(client):
+def test_the_document_names_every_route(client):
     document = client.get("/openapi.json").json()
     with a_service() as service:
         app = create_app(service)
@@ -280,16 +280,6 @@ def test_the_document_names_every_route_and_every_example_is_served(client):
     }
     named = {(path, method) for path, methods in document["paths"].items() for method in methods}
     assert routes == named
-    for path, method in named:
-        contents = document["paths"][path][method].get("requestBody", {}).get("content", {})
-        for content in contents.values():
-            schema = {**content["schema"], "components": document["components"]}
-            for example in content.get("examples", {}).values():
-                jsonschema.validate(example["value"], schema)
-                answer = client.post(path, json=example["value"])
-                # Of another contract, or unknown here.
-                assert answer.status_code in (200, 404, 422), answer.text
-                assert re.search("unknown|does not hold|samples|channel", answer.text)
 
 
 METRICS = """
@@ -506,7 +496,7 @@ NOT_STARTED = """
 644; --token-file DIR/token; chmod 600
 600; --token-file DIR/token; at least 16 ASCII characters
 600; --token-file DIR/none; Cannot read the token file
-600; --cert DIR/cert.pem --host localhost; --cert and --key together
+600; --cert DIR/cert.pem --host localhost; a certificate and its key together
 600; --cert DIR/cert.pem --key DIR/locked.pem --host localhost; a key without a password
 """
 
