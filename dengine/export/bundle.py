@@ -159,7 +159,6 @@ def prepare_export(
     conditions = DecisionConditions(
         source.trace, source.force_limits, source.audit_rate, source.seed
     )
-    shape = (model.n_spaces, model.index.dim)
     examples = source.examples
     # (n, K, d), without the decider
     points = model.spaces.embed(examples) / model.scale[:, None] if len(examples) else examples
@@ -170,7 +169,7 @@ def prepare_export(
         defect = f"it does not run as TorchScript, {reason_of(error)}"
     if defect:
         raise ExportError(f"{model.name} cannot be exported: {defect}.")
-    return source, DecisionModule(source.trace, decider, shape, source.stops_all)
+    return source, DecisionModule(source.trace, decider, model.n_spaces, source.stops_all)
 
 
 def exportable(engine_or_model: Any, trace: TraceSpec | None = None) -> Exportable:

@@ -196,7 +196,9 @@ def test_every_damaged_file_is_refused(copy, kind):
         flipped, other_block = bytes([content[i] ^ 1 << j % 8]), content[j : j + 512]
         written = {"flip": flipped, "truncation": b"", "swap": other_block}[kind]
         rest = b"" if kind == "truncation" else content[i + len(written) :]
-        copy.write_bytes(content[:i] + written + rest)
+        copy.write_bytes(changed := content[:i] + written + rest)
+        if changed == content:  # both blocks are padding
+            continue
         with pytest.raises(ExportError, match="is damaged or truncated: its SHA-256 is"):
             load_exported(copy)
 
