@@ -23,7 +23,7 @@ import re
 import secrets
 import time
 import zipfile
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -179,21 +179,16 @@ def exportable(engine_or_model: Any, trace: TraceSpec | None = None) -> Exportab
     audits, the seed, the force limits, the version, the recipe, eight labelled traces, and a
     function that records events; of a model alone, which has none of these, it has some of the
     traces it was trained on. The model is not copied, and goes on learning. `trace` replaces the
-    `TraceSpec` of the engine or the model. If an `Exportable` is given, it is returned as it is,
-    and `trace` is ignored. Raises ExportError before the first training, for a baseline, and if the
-    engine's store was changed from outside; StoreError if it cannot be read. A damaged trace is
-    left out, and noted as an event in the store.
+    `TraceSpec` of the engine or the model. Raises ExportError before the first training, for a
+    baseline, and if the engine's store was changed from outside; StoreError if it cannot be read. A
+    damaged trace is left out, and noted as an event in the store.
     """
-    if isinstance(engine_or_model, Exportable):
-        return engine_or_model
     engine = engine_or_model if isinstance(engine_or_model, DataEngine) else None
-    model = engine_or_model
-    if engine is not None:
-        error = engine.state.integrity_error
-        if error:
-            raise ExportError(f"Expected a store as it was written, to export from: {error}")
-        trace = trace or engine.trace
-        model = engine.model
+    model = engine_or_model if engine is None else engine.model
+    if engine is not None and engine.state.integrity_error:
+        raise ExportError(
+            f"Expected a store as it was written, to export from: {engine.state.integrity_error}"
+        )
     if model is None or (isinstance(model, ModelPrediction) and not hasattr(model, "trace_shape")):
         raise ExportError(NOT_TRAINED)
     if not isinstance(model, ModelPrediction):
@@ -201,11 +196,11 @@ def exportable(engine_or_model: Any, trace: TraceSpec | None = None) -> Exportab
             f"Expected a DataEngine or a ModelPrediction to export, got {type(model).__name__}; a "
             "baseline stays in Python."
         )
-    source = Exportable(model, trace or model.trace_spec, examples=model.examples)
     if engine is None:
-        return source
-    return replace(
-        source,
+        return Exportable(model, trace or model.trace_spec, examples=model.examples)
+    return Exportable(
+        model,
+        trace or engine.trace or model.trace_spec,
         audit_rate=engine.policy.audited_share,
         seed=engine.seed,
         stops_all=engine.policy.stops == "all",
@@ -338,12 +333,11 @@ def read_checked(path: Path, key: FilePath | None = None) -> bytes:
         in PATH.sha256. With a key also if the key or the signature is missing or unreadable, or the
         content was not signed with this key.
     """
-    _read(path, most=0)  # if both are missing, the error names the file itself
+    content = _read(path)
     expected = _first_word(_read(sibling_path(path, "sha256"), SUM_BYTES))
     if not SHA256.fullmatch(expected):
         problem = f"{path}.sha256 holds no SHA-256 sum of {path.name}"
         raise ExportError(f"{problem}; copy it again together with {path.name}.")
-    content = _read(path)
     digest = hashlib.sha256(content).hexdigest()
     if digest != expected:
         raise ExportError(

@@ -72,7 +72,7 @@ class CellJournal:
     lines : list of JournalLine
         Accepted parts and labelled parts, in the order in which their outcomes became known.
     pending : JournalLine or None
-        The last part, if it was accepted and its outcome is not known; also the last of `lines`.
+        The last part, if its outcome is not known; the last of `lines` if it was accepted.
     sum : str
         SHA-256 of the export that the journal belongs to.
     cut : int
@@ -129,7 +129,7 @@ def read_journal(path: FilePath, spec: TraceSpec) -> CellJournal:
         )
     lines: list[JournalLine] = []
     parts: dict[str, JournalLine] = {}  # by id, with the label so far
-    unlabelled: list[JournalLine] = []  # the part decided last, until its label comes
+    pending: JournalLine | None = None  # the part decided last, until its label comes
     set_aside = ""
     crc = zlib.crc32(rows[0])
     crcs = [crc]
@@ -157,24 +157,24 @@ def read_journal(path: FilePath, spec: TraceSpec) -> CellJournal:
                 line = replace(parts[words[0]], label=LABELS[words[1]])
         if kind == "part":
             # Only when the next part comes is an accepted one of unknown outcome counted.
-            lines += unlabelled
-            unlabelled = [line] if line.label is None else []
+            lines += filter(None, [pending])
+            pending = line if line.label is None else None
+        elif pending is not None and pending.decision.id == line.decision.id:
+            pending = None
         else:
-            is_late = line.decision.id not in [earlier.decision.id for earlier in unlabelled]
-            line = replace(line, late=is_late)
-            unlabelled = unlabelled if is_late else []
+            line = replace(line, late=True)
         parts[line.decision.id] = line
-        lines += [line] if line.label is not None else []
-    accepted = [line for line in unlabelled if line.decision.action is Action.ACCEPT]
+        if line.label is not None:
+            lines.append(line)
     lines = [
         line
-        for line in [*lines, *unlabelled]
+        for line in filter(None, [*lines, pending])
         if line.label is not None or line.decision.action is Action.ACCEPT
     ]
     if not lines:
         raise DataError(set_aside or f"{path} holds no labels yet.")
     set_aside = set_aside or _missing_at_end(path, crcs)
-    return CellJournal(lines, next(iter(accepted), None), head[3], len(tail), set_aside)
+    return CellJournal(lines, pending, head[3], len(tail), set_aside)
 
 
 def _missing_at_end(path: FilePath, crcs: list[int]) -> str:

@@ -18,6 +18,7 @@ import logging
 import warnings
 from importlib import import_module
 from importlib.util import find_spec
+from operator import attrgetter
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -55,6 +56,7 @@ N_CHECKED = 64  # random traces that a file is checked on before it is kept
 BOUND_TOLERANCE = 1e-6
 # References whose distance is the radius may fall on either side: runtimes add in another order.
 N_AT_EDGE = 2
+NUMBERS = attrgetter("lower", "upper", "n_success", "n_failure")
 
 
 def export_onnx(
@@ -113,13 +115,12 @@ def export_onnx(
     _refuse_unsupported(source)
     metadata = describe(source) | {"format": "onnx", "learns": False}
     program = _to_onnx(OnnxDecision(source).eval(), source.trace)
+    onnx_model = OnnxModel(program.SerializeToString(), metadata)
+    _check_decisions(onnx_model, source.model, source.trace)
     x = golden_trace(source.trace)
-    embedding = OnnxModel(program.SerializeToString(), metadata).decide(x).embedding
-    golden = {"trace": x.tolist(), "embedding": embedding.tolist()}
+    golden = {"trace": x.tolist(), "embedding": onnx_model.decide(x).embedding.tolist()}
     onnx.helper.set_model_props(program, {METADATA: json.dumps(metadata | {"golden": golden})})
-    content = program.SerializeToString()
-    _check_decisions(OnnxModel(content, metadata), source.model, source.trace)
-    return write_export(path, content, force, key, source)
+    return write_export(path, program.SerializeToString(), force, key, source)
 
 
 def load_onnx(path: FilePath, *, key: FilePath | None = None) -> "OnnxModel":
@@ -354,12 +355,10 @@ def _check_decisions(onnx_model: OnnxModel, model: Any, spec: TraceSpec) -> None
         X = np.clip(X, -0.9 * spec.limit, 0.9 * spec.limit)
     for actual, expected in zip(map(onnx_model.decide, X), model.predict_many(X), strict=True):
         is_near = np.allclose(actual.embedding, expected.embedding, rtol=TOLERANCE, atol=TOLERANCE)
-        n_moved = abs(actual.n_success - expected.n_success) + abs(
-            actual.n_failure - expected.n_failure
-        )
-        difference = abs(actual.lower - expected.lower) + abs(actual.upper - expected.upper)
-        same_counts = actual.action == expected.action and difference <= BOUND_TOLERANCE
-        if not is_near or n_moved > N_AT_EDGE or (n_moved == 0 and not same_counts):
+        differences = np.abs(np.subtract(NUMBERS(actual), NUMBERS(expected)))
+        n_moved = differences[2:].sum()
+        is_same = actual.action == expected.action and differences.sum() <= BOUND_TOLERANCE
+        if not is_near or n_moved > N_AT_EDGE or (n_moved == 0 and not is_same):
             raise ExportError(
                 f"onnxruntime does not decide as the model does: {actual} for {expected}; export "
                 "torchscript."

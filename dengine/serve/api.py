@@ -15,7 +15,7 @@ from dataclasses import dataclass, field, fields, is_dataclass
 from functools import cache, cached_property, reduce
 from http import HTTPStatus
 from inspect import Parameter, getdoc, signature
-from operator import or_
+from operator import methodcaller, or_
 from types import UnionType
 from typing import Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
 
@@ -92,10 +92,8 @@ def _request_type(handler: Callable[..., Any], optional_fields: Json) -> type[St
     for name, parameter in signature(handler).parameters.items():
         if parameter.kind is Parameter.VAR_KEYWORD:
             continue
-        if parameter.default is Parameter.empty:
-            members.append((name, hints[name]))
-        else:
-            members.append((name, hints[name], parameter.default))
+        default = () if parameter.default is Parameter.empty else (parameter.default,)
+        members.append((name, hints[name], *default))
     members += [(name, hint | UnsetType, UNSET) for name, hint in optional_fields.items()]
     return msgspec.defstruct(
         f"{handler.__name__.capitalize()}Request",
@@ -348,7 +346,6 @@ DecisionResponse: Any = _response_type(
     "A decision with its label.",
     StoredDecision,
     without=("content_hash",),  # JavaScript has no integers of 64 bits
-    trace=_described(Traces | None, "Null unless it was requested."),
 )
 RESPONSES = {
     response.__name__: response
@@ -413,14 +410,11 @@ def json_response(
 ) -> Response:
     """Return an HTTP response with `body` as JSON; a number that is not finite becomes null.
 
-    NumPy arrays become lists, and an object that JSON has no type for becomes `str(object)`.
-    `status` is the HTTP status, `headers` are added to the response, and `media` is its media type.
+    NumPy arrays become lists. `status` is the HTTP status, `headers` are added to the response, and
+    `media` is its media type. Raises AttributeError for an object that JSON has no type for.
     """
-
-    def encoded(value: Any) -> Any:
-        return value.tolist() if isinstance(value, np.ndarray | np.generic) else str(value)
-
-    return Response(msgspec.json.encode(body, enc_hook=encoded), status, headers, media)
+    content = msgspec.json.encode(body, enc_hook=methodcaller("tolist"))
+    return Response(content, status, headers, media)
 
 
 def problem_response(
@@ -483,7 +477,9 @@ class Operation:
     ----------
     method, path : str
     handler : callable
-        Called with the request's fields as keyword arguments. Its docstring is the summary.
+        Called with the request's fields as keyword arguments. Its docstring is the summary. It
+        returns the fields of the response as a dict, a record that has these fields, or a whole
+        response.
     response : str
         A name in `RESPONSES`, or a media type.
     optional_fields : dict
@@ -495,7 +491,7 @@ class Operation:
 
     method: str
     path: str
-    handler: Callable[..., Awaitable[Json | Response]]
+    handler: Callable[..., Awaitable[object]]
     response: str
     optional_fields: Json = field(default_factory=dict)
     raw_parameter: str = ""
@@ -512,9 +508,9 @@ class Operation:
         the operation has a `raw_parameter` and the body is bytes (application/octet-stream), the
         body is the field of this name, and the other fields are read from the query. Optional
         fields that were left out are not passed on. If the handler returns no response, its result
-        is sent as JSON. Raises HTTPException for a request that cannot be read, ClientDisconnect
-        for one that is cut off, and whatever the handler raises; the application turns all into
-        responses.
+        is sent as JSON, a record with the fields of the response type. Raises HTTPException for a
+        request that cannot be read, ClientDisconnect for one that is cut off, and whatever the
+        handler raises; the application turns all into responses.
         """
         if self.method == "GET":
             values = read_query(request, self.request_type)
@@ -526,7 +522,10 @@ class Operation:
             values = await read_body(request, self.request_type, *other_types)
         given = msgspec.structs.asdict(values).items()
         result = await self.handler(**{key: value for key, value in given if value is not UNSET})
-        return result if isinstance(result, Response) else json_response(result)
+        if isinstance(result, Response):
+            return result
+        is_json = isinstance(result, dict)
+        return json_response(result if is_json else response_fields(self.response, result))
 
     def describe(self, schemas: Json) -> Json:
         """Return the operation as an OpenAPI operation object, a dict.

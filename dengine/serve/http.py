@@ -30,8 +30,8 @@ from ..decision.policy import Policy
 from ..engine.corrections import Changed
 from ..engine.engine import DataEngine
 from ..history.explain import explain, find_decision_id
-from ..history.map import part_map
-from ..history.status import iterate_decisions, read_course
+from ..history.map import PartMap, part_map
+from ..history.status import Course, iterate_decisions, read_course
 from ..records import Action, is_name
 from ..store.records import StoredDecision, unknown_decision
 from ..store.views import HistoryFilter
@@ -39,8 +39,9 @@ from . import api
 from .api import Json, Operation, field_types, response_fields
 from .auth import CURRENT_TOKEN, Guard, Token
 from .metrics import Metrics
-from .service import CellService
-from .xmlrpc import routes as xmlrpc_routes
+from .robot_calls import RobotCalls
+from .service import CellService, ReportResponse
+from .xmlrpc import rpc_route
 
 if TYPE_CHECKING:
     from ..cells.ur.recorder import RtdeRecorder
@@ -84,8 +85,8 @@ class HttpApi:
     """The handlers of all HTTP requests.
 
     A handler's parameters are the request's fields, and its docstring is its summary in the OpenAPI
-    document. It returns the fields of the response as JSON, or a whole response. What it raises
-    becomes a `Problem`, as `api.STATUSES` says.
+    document. What it may return is said by `Operation`. What it raises becomes a `Problem`, as
+    `api.STATUSES` says.
 
     Parameters
     ----------
@@ -172,7 +173,7 @@ class HttpApi:
         id_: Id = "",
         part: PartNumber = "",
         author: Author = "",
-    ) -> Json:
+    ) -> ReportResponse:
         """Report the outcome of a part. The label is on disk when the response comes.
 
         State either the decision's id or the part; both or neither is 422, and so are an invalid
@@ -188,8 +189,7 @@ class HttpApi:
         """
         checked = _checked_author(author) if author or CURRENT_TOKEN.get().name else ""
         decision_id = await self._find_id(id_, part)
-        response = await self.service.report(decision_id, success, checked)
-        return response_fields("ReportResponse", response)
+        return await self.service.report(decision_id, success, checked)
 
     async def _find_id(self, id_: str, part: str) -> str:
         """Return the id of a decision, given by its id or by its part's number.
@@ -212,7 +212,7 @@ class HttpApi:
         id_: Id = "",
         part: PartNumber = "",
         author: Author = "",
-    ) -> Json:
+    ) -> Changed:
         """Correct a label, from the next decision on, record that as an event, and return what
         changed.
 
@@ -234,7 +234,7 @@ class HttpApi:
         ids: Annotated[list[str], Meta(description="Of the decisions.")],
         author: Author = "",
         reason: Annotated[str, Meta(description="For the event log.")] = "",
-    ) -> Json:
+    ) -> Changed:
         """Leave the labels of the decisions `ids` out of training and of all counts, record that as
         an event with the reason, and return what changed.
 
@@ -255,7 +255,7 @@ class HttpApi:
         self,
         version: Annotated[int, Meta(description="Its number, as /versions lists it.")],
         author: Author = "",
-    ) -> Json:
+    ) -> Changed:
         """Let an earlier version of the model decide again, as a new version, and pin it: no
         automatic retrain replaces it, until /release or /retrain, or until /forget of a label that
         it was trained with. A training under way is discarded. If it is pinned already, nothing
@@ -265,7 +265,7 @@ class HttpApi:
         """
         return await self._change(author, lambda engine, by: engine.rollback(version, by))
 
-    async def release(self, author: Author = "") -> Json:
+    async def release(self, author: Author = "") -> Changed:
         """Let retrains replace a version again that /rollback pinned; if none is pinned, nothing
         changes, but a training under way begins again. 422: no author (unless the token has a
         name), or an author that is not the token's; 503: the queue is full, or the store does not
@@ -273,7 +273,7 @@ class HttpApi:
         """
         return await self._change(author, lambda engine, by: engine.release(by))
 
-    async def policy(self, author: Author = "", **changes: Any) -> Json:
+    async def policy(self, author: Author = "", **changes: Any) -> Changed:
         """Change settings of the policy, from the next decision on; shadow verifies every part.
 
         Settings that are left out stay as they are. Many changes start the decision rule anew, so
@@ -286,7 +286,7 @@ class HttpApi:
             author, lambda engine, by: engine.set_policy(engine.policy.changed(**changes), by)
         )
 
-    async def retrain(self, author: Author = "") -> Json:
+    async def retrain(self, author: Author = "") -> Changed:
         """Begin a retrain, record who asked for it as an event, and do not wait for its end.
 
         A pinned version is released, so that the new version may replace it. If a retrain is under
@@ -303,17 +303,14 @@ class HttpApi:
 
             If a retrain is under way, or waits until it can begin, nothing is done.
             """
-            if engine.state.is_retraining:
-                return Changed(
-                    "retrain",
-                    "A retrain is under way already; nothing changed.",
-                    None,
-                    engine.version,
-                )
-            engine.release(by)
-            event = engine.store.events.put("retrain", "asked for by hand", author=by)
-            engine.retrain(wait=False)
-            return Changed("retrain", "The retrain has begun.", event, engine.version)
+            event = None
+            text = "A retrain is under way already; nothing changed."
+            if not engine.state.is_retraining:
+                engine.release(by)
+                event = engine.store.events.put("retrain", "asked for by hand", author=by)
+                engine.retrain(wait=False)
+                text = "The retrain has begun."
+            return Changed("retrain", text, event, engine.version)
 
         return await self._change(author, begin)
 
@@ -333,16 +330,11 @@ class HttpApi:
         texts = {"alarm": status.alarm, "claim": status.certificate.sentence}
         return response_fields("Status", status, **texts, **line)
 
-    async def decision(
-        self,
-        id_: Id,
-        trace: Annotated[bool, Meta(description="Include its samples.")] = False,
-    ) -> Json:
+    async def decision(self, id_: Id) -> StoredDecision:
         """Return one decision with its label; 404 for an unknown id, 422 for an invalid one, 503 if
         the queue is full or the id cannot be looked up.
         """
-        stored = await self._find(id_)
-        return response_fields("Decision", stored, trace=stored.trace if trace else None)
+        return await self._find(id_)
 
     async def decisions(
         self,
@@ -357,8 +349,8 @@ class HttpApi:
         ] = "",
         **where: Any,
     ) -> Json:
-        """Return up to `limit` decisions without their traces, newest first, and in `older` the id
-        that `before` takes for the next page, null if none are left. An unknown `before` is 404.
+        """Return up to `limit` decisions, newest first, and in `older` the id that `before` takes
+        for the next page, null if none are left. An unknown `before` is 404.
 
         Only decisions with the given label, action, reason, predicted (what the model alone would
         have done) and part (the part's number) are returned, if these are given, and only those
@@ -367,13 +359,14 @@ class HttpApi:
         `before`; 503: the queue is full, or the store cannot be read.
         """
         selection = HistoryFilter(label=label, **where)
-        before_id = (await self._find(before)).decision.id if before else None
+        if before:
+            await self._find(before)
         stored = await self.service.read(
-            lambda store: _read_newest(store, selection, limit + 1, before_id, open_)
+            lambda store: _read_newest(store, selection, limit + 1, before or None, open_)
         )
         page = stored[:limit]
         return {
-            "decisions": [response_fields("Decision", item, trace=None) for item in page],
+            "decisions": [response_fields("Decision", item) for item in page],
             "older": page[-1].decision.id if len(stored) > limit else None,
         }
 
@@ -387,7 +380,7 @@ class HttpApi:
         """
         return await self.service.read(lambda store: _read_explanation(store, id_))
 
-    async def course(self, hours: ShiftHours = 0, start: ShiftStart = 0.0) -> Json:
+    async def course(self, hours: ShiftHours = 0, start: ShiftStart = 0.0) -> Course:
         """Return counts of the decisions in stretches, oldest first, with retrains and safe modes.
 
         A stretch is a number of decisions that are counted together. With `hours` a stretch is a
@@ -398,10 +391,9 @@ class HttpApi:
         """
         recipe = self.service.engine.recipe
         by = {"seconds": 3600.0 * hours, "start": 3600.0 * start}
-        course = await self.service.read(lambda store: read_course(store, recipe, N_LABELS, **by))
-        return response_fields("Course", course)
+        return await self.service.read(lambda store: read_course(store, recipe, N_LABELS, **by))
 
-    async def embedding(self) -> Json:
+    async def embedding(self) -> PartMap:
         """Return where parts lie in the model's embedding, in two dimensions.
 
         The parts are the newest 250 references with a label of this cell and, of its newest 10
@@ -410,10 +402,7 @@ class HttpApi:
         503: the queue is full, or the store cannot be read.
         """
         engine = self.service.engine
-        parts = await self.service.read(
-            lambda store: part_map(store, engine.recipe, engine.version)
-        )
-        return response_fields("PartMap", parts)
+        return await self.service.read(lambda store: part_map(store, engine.recipe, engine.version))
 
     async def versions(self) -> Json:
         """Return every retrain of the cell or its product, dropped ones included, oldest first; a
@@ -445,9 +434,9 @@ class HttpApi:
 
         return StreamingResponse(event_stream(), media_type="text/event-stream")
 
-    async def me(self) -> Json:
+    async def me(self) -> Token:
         """Return the name and the rights of the request's token."""
-        return response_fields("Me", CURRENT_TOKEN.get())
+        return CURRENT_TOKEN.get()
 
     async def metrics(self) -> Response:
         """Return the metrics for Prometheus."""
@@ -490,17 +479,15 @@ class HttpApi:
             raise unknown_decision(id_)
         return stored
 
-    async def _change(self, author: str, work: Callable[[DataEngine, str], Changed]) -> Json:
+    async def _change(self, author: str, work: Callable[[DataEngine, str], Changed]) -> Changed:
         """Call `work` in the engine's thread with the engine and the author, and return its
         `Changed`.
 
-        The result is in the form of the response. Raises HTTPException for an author that
-        `_checked_author` does not take, BusyError if the queue is full or the service is closing,
-        and what `work` raises.
+        Raises HTTPException for an author that `_checked_author` does not take, BusyError if the
+        queue is full or the service is closing, and what `work` raises.
         """
         by = _checked_author(author)
-        changed = await self.service.call(lambda engine: work(engine, by))
-        return response_fields("Changed", changed)
+        return await self.service.call(lambda engine: work(engine, by))
 
 
 def _checked_author(author: str) -> str:
@@ -593,7 +580,7 @@ def create_app(
         Route(operation.path, operation.serve, methods=[operation.method])
         for operation in HttpApi(service).operations
     ]
-    routes += xmlrpc_routes(service, recorder)
+    routes.append(rpc_route(RobotCalls(service, recorder)))
     routes += [Route(path, _index_page) for path in VIEWS]
     routes.append(Mount("/page/static", StaticFiles(directory=STATIC)))
 

@@ -15,7 +15,6 @@ import logging
 import os
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 from contextlib import asynccontextmanager, suppress
-from functools import wraps
 from pathlib import Path
 from typing import Any
 
@@ -201,8 +200,6 @@ class AddressSpace:
         self._server = server
         self._service = service
         self._calls = RobotCalls(service)
-        self._nodes: dict[str, Node] = {}
-        self._types: dict[str, VariantType] = {}
         self._alarm = ""
 
     async def build(self) -> None:
@@ -212,26 +209,23 @@ class AddressSpace:
         that sends alarm events. Call it once, before the server starts.
         """
         await self._server.import_xml(str(Path(__file__).with_name("cell.xml")))
-        index = await self._server.get_namespace_index(NAMESPACE)
-
-        def node_of(name: str) -> Node:
-            return self._server.get_node(ua.NodeId(ua.String(name), ua.Int16(index)))
-
-        for name in (*STATUS_NAMES, "LastRefused"):
-            self._nodes[name] = node_of(f"Cell.{name}")
-        for name in STATUS_NAMES:
-            self._types[name] = await self._nodes[name].read_data_type_as_variant_type()
-        await self._nodes["LastRefused"].write_value("")  # the file's empty text is read as null
+        self._namespace = await self._server.get_namespace_index(NAMESPACE)
+        await self._node("LastRefused").write_value("")  # the file's empty text is read as null
         for name, call in (("Decide", self.decide), ("Report", self.report)):
-            node = node_of(f"Cell.{name}")
+            node = self._node(name)
             arguments, results = [
                 await (await node.get_child(f"0:{kind}Arguments")).read_value()
                 for kind in ("Input", "Output")
             ]
             self._server.link_method(node, self._as_method(call, arguments, results))
         self._events: EventGenerator = await self._server.get_event_generator()
-        self._events.event.SourceNode = node_of("Cell").nodeid
+        cell = self._server.get_node(f"ns={self._namespace};s=Cell")
+        self._events.event.SourceNode = cell.nodeid
         self._events.event.SourceName = "Cell"
+
+    def _node(self, name: str) -> Node:
+        """Return the node of a variable or a method of the cell."""
+        return self._server.get_node(f"ns={self._namespace};s=Cell.{name}")
 
     async def decide(self, trace: list[float], channels: int, request: str, part: str) -> list[Any]:
         """Decide on a flat trace: all samples of the first channel, then those of the next.
@@ -292,7 +286,7 @@ class AddressSpace:
             log.warning("the OPC UA variables could not be brought up to date: %s", error)
             status = _status_code(StatusCodes.UncertainLastUsableValue)
             for name in STATUS_NAMES:
-                node = self._nodes[name]
+                node = self._node(name)
                 old = await node.read_data_value(raise_on_bad_status=False)
                 await node.write_value(ua.DataValue(old.Value, status))
 
@@ -304,11 +298,10 @@ class AddressSpace:
         ended.
         """
         for name, key in STATUS_NAMES.items():
-            value = status[key]
-            if self._types[name] is VariantType.Boolean:
-                value = bool(value)
-            data = ua.DataValue(ua.Variant(value, self._types[name]))
-            await self._nodes[name].write_value(data)
+            node = self._node(name)
+            type_ = await node.read_data_type_as_variant_type()
+            value = bool(status[key]) if type_ is VariantType.Boolean else status[key]
+            await node.write_value(value, type_)
         alarm = status["alarm"]
         if alarm != self._alarm:
             self._events.event.Severity = ALARM if alarm else ALARM_ENDED
@@ -330,11 +323,9 @@ class AddressSpace:
         logged.
         """
         forms = [_form(_type_of(item), item.ValueRank > 0) for item in arguments]
-        listed = ", ".join(
-            f"{item.Name} ({form})" for item, form in zip(arguments, forms, strict=True)
-        )
+        names = [item.Name for item in arguments]
+        expected = ", ".join(map("{} ({})".format, names, forms))
 
-        @wraps(call)
         async def method(parent: ua.NodeId, *variants: ua.Variant) -> Any:
             """Check the arguments, call, and return the results; for an error write its text into
             LastRefused, and return a bad status code.
@@ -343,7 +334,7 @@ class AddressSpace:
             texts = [ua.Variant("") if item.Value is None else item for item in variants]
             given = [_form(item.VariantType, isinstance(item.Value, list)) for item in texts]
             code = StatusCodes.BadInvalidArgument
-            line = f"Expected {listed}, got {', '.join(given) or 'none'}."
+            line = f"Expected {expected}, got {', '.join(given) or 'none'}."
             if given == forms:
                 try:
                     values = await call(*(item.Value for item in texts))
@@ -357,8 +348,7 @@ class AddressSpace:
                     log.exception("a call over OPC UA failed")
                     code = StatusCodes.BadInternalError
                     line = "The server failed on this call."
-            text = ua.Variant(one_line(line), VariantType.String)
-            await self._nodes["LastRefused"].write_value(ua.DataValue(text))
+            await self._node("LastRefused").write_value(one_line(line), VariantType.String)
             return _status_code(code)
 
         return method

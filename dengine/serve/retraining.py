@@ -74,8 +74,9 @@ class RetrainingProcess(Executor):
         """Queue a call of a picklable function, which runs in the process after earlier calls.
 
         Returns the future of its result. Wait for it before you submit the next call: the end of
-        the next call closes the file that holds the result. An exception of the call, or an argument or result that cannot be pickled, is the future's.
-        Raises BrokenExecutor if the process has ended, and RuntimeError after `shutdown`.
+        the next call closes the file that holds the result. An exception of the call, or an
+        argument or result that cannot be pickled, is the future's. Raises BrokenExecutor if the
+        process has ended, and RuntimeError after `shutdown`.
         """
         call = _SharedPickle((fn, args, kwargs))
         return self._pool.submit(_call, call)  # type: ignore[arg-type]  # arrives as the tuple

@@ -18,7 +18,6 @@ from __future__ import annotations
 import asyncio
 import uuid
 from collections import OrderedDict
-from collections.abc import Awaitable, Callable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -48,7 +47,7 @@ MAX_SAMPLES = 200_000  # of all pieces of a part
 BUSY = "busy"  # reasons beside `Reason`, if nothing was recorded
 NOT_RECORDED = "not_recorded"
 
-CALLS = (
+CALLS = (  # names of the methods that are served over XML-RPC
     "begin",
     "add",
     "decide",
@@ -63,7 +62,6 @@ CALLS = (
 Struct = dict[str, Any]
 # A VERIFY that was not recorded, but for its reason.
 UNRECORDED: Struct = {"action": 0, "id": "", "lower": 0.0, "upper": 1.0, "version": 0}
-Call = Callable[..., Awaitable[Any]]
 
 
 class RobotCalls:
@@ -82,10 +80,6 @@ class RobotCalls:
         self._pieces: OrderedDict[str, list[TraceArray]] = OrderedDict()
         self._armed: str | None = None  # id of the part that is recorded
         self._recorder_lock = asyncio.Lock()
-
-    def table(self) -> dict[str, Call]:
-        """Return each method by its name; its signature says which arguments it takes."""
-        return {name: getattr(self, name) for name in CALLS}
 
     async def begin(self, request: Any = "") -> str:
         """Begin a new part, and have the recorder wait for its insertion.

@@ -258,8 +258,9 @@ def quick_switches() -> Iterator[None]:
 
 @contextmanager
 def listening_socket(host: str, port: int) -> Iterator[socket.socket]:
-    """Open a listening TCP socket at the host's first address, yield it, and close it when the
-    block ends.
+    """Open a listening TCP socket, yield it, and close it when the block ends.
+
+    The host is an address, or a name that has an address of IPv4.
 
     Port 0 takes a free port. Raises SettingError if the socket cannot be opened, for example
     because the port is in use or the host is unknown.
@@ -272,9 +273,8 @@ def listening_socket(host: str, port: int) -> Iterator[socket.socket]:
         UnicodeError,
         do="name another port or address, --port or --host",
     ):
-        addresses = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
-        family, _, _, _, address = addresses[0]
-        listening = socket.create_server(address[:2], family=family, backlog=128)
+        family = socket.AF_INET6 if ":" in host else socket.AF_INET
+        listening = socket.create_server((host, port), family=family, backlog=128)
     with listening:
         # Its connections inherit this option. Without it the second piece of a response waits 40 ms
         # for the confirmation of the first.

@@ -240,7 +240,7 @@ class CellService:
             decision_id = id_ if late or request is not None else None
             return engine.decide(trace, part, decision_id=decision_id, timed_out=late)
 
-        future = self._enqueue(work)
+        future = self.submit(work)
         pending = asyncio.wrap_future(future)
         await asyncio.wait([pending], timeout=self.deadline)
         if pending.done() or not future.cancel():
@@ -341,15 +341,28 @@ class CellService:
         and listeners to `changes` are not notified. Raises BusyError if the queue is full or the
         service is closing; nothing is called then.
         """
-        return await asyncio.wrap_future(self.submit(work, read_only))
+        return await asyncio.wrap_future(self.submit(lambda engine, late: work(engine), read_only))
 
-    def submit(self, work: Callable[[DataEngine], T], read_only: bool = False) -> Future[T]:
-        """Put a function, as `call` takes it, into the queue, from any thread; return a future of
-        its result.
+    def submit(self, work: Callable[[DataEngine, bool], T], read_only: bool = False) -> Future[T]:
+        """Put work into the queue for the engine's thread, from any thread, and return its future.
 
-        Raises BusyError if the queue is full or the service is closing.
+        `work` is called with the engine and with whether the future was cancelled. A cancelled
+        future does not stop the work, but the result is dropped. After the work every iteration
+        over `changes` goes on, unless the work is `read_only`. Raises BusyError if the service is
+        closing, or if the queue is full; only a full queue is counted, in `busy`.
         """
-        return self._enqueue(lambda engine, late: work(engine), read_only)
+        job = Job(Future(), work, read_only)
+        if self._closing or not self._thread.is_alive():
+            raise BusyError(CLOSING)
+        try:
+            self._jobs.put_nowait(job)
+        except queue.Full:
+            self.busy += 1
+            raise BusyError(
+                f"Expected at most {self._jobs.maxsize} requests in line: verify the part, "
+                "nothing of it was recorded."
+            ) from None
+        return job.future
 
     async def read(self, work: Callable[[SqlStore], T]) -> T:
         """Let the engine write all that it has recorded to the store, call `work` with the store,
@@ -439,27 +452,6 @@ class CellService:
         self.end_listening()
         if self.read_store is not self.engine.store:
             self.read_store.close()
-
-    def _enqueue(self, work: Callable[[DataEngine, bool], T], read_only: bool = False) -> Future[T]:
-        """Put work into the queue for the engine's thread, and return a future of its result.
-
-        `work` is called with the engine and with whether the future was cancelled. A cancelled
-        future does not stop the work, but the result is dropped. After the work every iteration
-        over `changes` goes on, unless the work is `read_only`. Raises BusyError if the service is
-        closing, or if the queue is full; only a full queue is counted, in `busy`.
-        """
-        job = Job(Future(), work, read_only)
-        if self._closing or not self._thread.is_alive():
-            raise BusyError(CLOSING)
-        try:
-            self._jobs.put_nowait(job)
-        except queue.Full:
-            self.busy += 1
-            raise BusyError(
-                f"Expected at most {self._jobs.maxsize} requests in line: verify the part, "
-                "nothing of it was recorded."
-            ) from None
-        return job.future
 
     def _notify_observers(self, response: T) -> T:
         """Call each function in `observers` with a response or a `RetrainReport`; return the

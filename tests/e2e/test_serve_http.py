@@ -168,7 +168,7 @@ def test_what_can_be_looked_at_is_as_the_document_says_also_of_a_trace_that_lack
     trace = [*stream.X[8].tolist()[:-1], None]
     answer = client.ask("/decide", trace=trace, request="missing/sample ?").json()
     assert (answer["action"], answer["reason"]) == ("verify", "not_finite")
-    shown = client.get("/decisions/missing%2Fsample%20%3F?trace=true").json()
+    shown = client.get("/explanations/missing%2Fsample%20%3F").json()
     assert shown["trace"][0][-1] is None
     for path, schema in rows(LOOKS):
         validate(client.get(path).json(), schema, client)
@@ -358,7 +358,7 @@ def test_what_is_no_trace_is_refused_and_leaves_nothing(client, stream):
 
 def test_a_full_line_says_verify_and_when_to_come_again(stream):
     with serving(most=1) as (service, client), busy_engine(service):
-        service.submit(lambda engine: None)
+        service.submit(lambda engine, late: None)
         answer = client.decide(stream.X[0], "order-0")
         must_be_problem(answer, 503)
         assert int(answer.headers["retry-after"]) >= 1

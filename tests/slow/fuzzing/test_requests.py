@@ -127,7 +127,7 @@ def send(port: int, sent: bytes, ended: bool = False) -> bytes:
 
 
 def read_decisions(service: CellService) -> dict[str, str]:
-    service.submit(DataEngine.flush).result(60)
+    service.submit(lambda engine, late: engine.flush()).result(60)
     store = service.read_store.decisions
     ids = [item.decision.id for item in store.select(HistoryFilter(), 10**6)]
     return {item.decision.id: f"{item} {item.trace.tolist()}" for item in map(store.get, ids)}
