@@ -24,6 +24,7 @@ import secrets
 import time
 import zipfile
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -68,11 +69,10 @@ def make_key(path: FilePath) -> Path:
         file that was begun then stays.
     """
     target = Path(path)
-    flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL
     do = "name a new file in a folder that is writable; files may be signed with an old key"
     with (
         instead(ExportError, f"Cannot write {target}", OSError, do=do),
-        os.fdopen(os.open(target, flags, 0o600), "w", encoding="ascii") as file,
+        open(target, "x", encoding="ascii", opener=partial(os.open, mode=0o600)) as file,
     ):
         file.write(secrets.token_hex(32) + "\n")
         file.flush()
@@ -90,9 +90,9 @@ def signature(content: bytes, key: FilePath) -> str:
 
 
 def sibling_path(path: FilePath, suffix: str) -> Path:
-    """Return the path of a file's checksum (sha256) or signature (sig), PATH.SUFFIX.
+    """Return the path of a file's checksum (sha256), signature (sig) or head (head), PATH.SUFFIX.
 
-    `sha256sum --check` reads the former.
+    `sha256sum --check` reads the first.
     """
     return Path(f"{os.fspath(path)}.{suffix}")
 
@@ -189,13 +189,13 @@ def exportable(engine_or_model: Any, trace: TraceSpec | None = None) -> Exportab
         raise ExportError(
             f"Expected a store as it was written, to export from: {engine.state.integrity_error}"
         )
-    if model is None or (isinstance(model, ModelPrediction) and not hasattr(model, "trace_shape")):
-        raise ExportError(NOT_TRAINED)
-    if not isinstance(model, ModelPrediction):
+    if model is not None and not isinstance(model, ModelPrediction):
         raise ExportError(
             f"Expected a DataEngine or a ModelPrediction to export, got {type(model).__name__}; a "
             "baseline stays in Python."
         )
+    if model is None or not hasattr(model, "trace_shape"):
+        raise ExportError(NOT_TRAINED)
     if engine is None:
         return Exportable(model, trace or model.trace_spec, examples=model.examples)
     return Exportable(
@@ -358,7 +358,7 @@ def read_checked(path: Path, key: FilePath | None = None) -> bytes:
 
 def _first_word(content: bytes) -> str:
     """Return the sum or the signature at the start of a line, "" of an empty one."""
-    return (content.decode("utf-8", errors="replace").split() or [""])[0]
+    return content.decode("utf-8", errors="replace").partition(" ")[0].strip()
 
 
 def _read(path: Path, most: int = -1) -> bytes:

@@ -16,7 +16,6 @@ it is left out. A line that fits its checksum was written by a cell. If it canno
 example because its traces have another shape, DataError is raised and names the line.
 """
 
-import os
 import zlib
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
@@ -32,6 +31,7 @@ from ..recipe import Recipe
 from ..records import Action, Decision, Reason, TraceArray, TraceSpec, stored_trace_spec
 from ..store.opening import opening
 from ..traces import as_trace
+from .bundle import sibling_path
 
 if TYPE_CHECKING:
     from ..store.opening import StoreLike
@@ -184,7 +184,7 @@ def _missing_at_end(path: FilePath, crcs: list[int]) -> str:
     `crcs` are the checksums of the journal's lines, the first line included. If the head is missing
     or cannot be read, a warning is logged and "" is returned.
     """
-    head = Path(f"{os.fspath(path)}.head")
+    head = sibling_path(path, "head")
     risk = "lines may have been removed at its end, or lost with the power."
     try:
         number, crc = head.read_text(encoding="ascii").split()

@@ -1,7 +1,7 @@
 """The module inside an exported file: `DecisionModule`, a `Decider` that also learns from reported
 outcomes. It decides as `DataEngine.decide` does, and learns as `DataEngine.report` does between two
 retrains. `bundle.prepare_export` builds it; TorchScript compiles it; `ExportedModel` and the C++
-program call the methods in `METHODS`.
+program call the exported methods.
 """
 
 from typing import NamedTuple
@@ -16,18 +16,6 @@ from ..traces import can_fit_length, fit_length
 # action, reason, lower, upper, n_success, n_failure, embedding
 DecisionFields = tuple[int, int, float, float, int, int, Tensor]
 FIELDS = ("action", "reason", "lower", "upper", "n_success", "n_failure", "embedding")
-METHODS = (
-    "forward",
-    "decide",
-    "learn",
-    "stop",
-    "settle",
-    "safe_mode",
-    "restore",
-    "predicted",
-    "drop",
-    "n_references",
-)
 
 
 class DecidedTrace(NamedTuple):

@@ -17,7 +17,7 @@ from http import HTTPStatus
 from inspect import Parameter, getdoc, signature
 from operator import methodcaller, or_
 from types import UnionType
-from typing import Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
 import msgspec
 import numpy as np
@@ -44,11 +44,11 @@ from ..errors import (
 from ..history.explain import Explanation
 from ..history.map import PartMap
 from ..history.status import Course, Status
-from ..records import Action, Decision, TraceArray
+from ..records import Action, TraceArray
 from ..representation import to_jsonable
 from ..store.records import Correction, Event, StoredDecision, StoredVersion, VersionError
 from ..traces import LARGEST
-from .service import ReportResponse
+from .service import ReportResponse, ServiceResponse
 
 T = TypeVar("T")
 Json = dict[str, Any]
@@ -112,23 +112,14 @@ def media_type(request: Request) -> str:
     return request.headers.get("content-type", "").partition(";")[0].strip().lower()
 
 
-async def read_body(request: Request, struct_type: type[T], *other_types: str) -> T:
+async def read_body(request: Request, struct_type: type[T]) -> T:
     """Decode a request's JSON body into a struct of `struct_type`, and return the struct.
 
-    The body is an object without nested objects. Raises HTTPException: 415 for another media type
-    than JSON, 400 for a body that is no JSON or has a name twice, 422 for fields that the type does
-    not take. The message of 415 also lists `other_types`, the media types that the caller reads
-    itself. Raises ClientDisconnect if the client goes away before the whole body has come, and
-    HTTPException 413 while it is read, if `Guard` finds it too large.
+    The body is an object without nested objects. Raises HTTPException: 400 for a body that is no
+    JSON or has a name twice, 422 for fields that the type does not take. Raises ClientDisconnect if
+    the client goes away before the whole body has come, and HTTPException 413 while it is read, if
+    `Guard` finds it too large.
     """
-    media = media_type(request)
-    if media != JSON:
-        accepted = ", ".join((JSON, *other_types))
-        raise HTTPException(
-            415,
-            f"Expected a body of {accepted}, got {shortened(media)}.",
-            {"Accept": accepted},
-        )
     body = await request.body()
     try:
         decoded = msgspec.json.decode(body, type=struct_type)
@@ -246,8 +237,7 @@ def _response_type(
     """
     members = _json_field_types(record) if record else {}
     types = {key: hint for key, hint in members.items() if key not in without}
-    docs = [about, (getdoc(record) or "") if record else ""]
-    doc = "\n\n".join(filter(None, docs))
+    doc = "\n\n".join(filter(None, [about, getdoc(record) if record else None]))
     return msgspec.defstruct(name, (types | more).items(), namespace={"__doc__": doc}, kw_only=True)
 
 
@@ -293,7 +283,7 @@ def _described(hint: Any, text: str) -> Any:
 class Health(Struct):
     """Whether the engine answers."""
 
-    status: Annotated[str, Meta(extra_json_schema={"enum": ["ok", "degraded", "down"]})]
+    status: Literal["ok", "degraded", "down"]
     store_fault: Annotated[str, Meta(description="Why the store cannot be written, or empty.")]
     retrain_fault: Annotated[
         str, Meta(description="Why retrains are dropped again and again, or empty.")
@@ -353,7 +343,7 @@ RESPONSES = {
         _response_type(
             "DecideResponse",
             "The response to a trace.",
-            Decision,
+            ServiceResponse,
             late=_described(bool, "The deadline passed; recorded as VERIFY."),
             seconds=_described(float, "From the request to the response, in the server."),
         ),
@@ -512,14 +502,18 @@ class Operation:
         request that cannot be read, ClientDisconnect for one that is cut off, and whatever the
         handler raises; the application turns all into responses.
         """
+        media = media_type(request)
         if self.method == "GET":
             values = read_query(request, self.request_type)
-        elif self.raw_parameter and media_type(request) == RAW:
+        elif media == JSON:
+            values = await read_body(request, self.request_type)
+        elif media == RAW and self.raw_parameter:
             body = {self.raw_parameter: await request.body()}
             values = read_query(request, self.request_type, **body)
         else:
-            other_types = [RAW] if self.raw_parameter else []
-            values = await read_body(request, self.request_type, *other_types)
+            accepted = f"{JSON}, {RAW}" if self.raw_parameter else JSON
+            problem = f"Expected a body of {accepted}, got {shortened(media)}."
+            raise HTTPException(415, problem, {"Accept": accepted})
         given = msgspec.structs.asdict(values).items()
         result = await self.handler(**{key: value for key, value in given if value is not UNSET})
         if isinstance(result, Response):

@@ -14,7 +14,6 @@ import ssl
 import stat
 from contextvars import ContextVar
 from dataclasses import dataclass, field
-from http import HTTPStatus
 from ipaddress import ip_address
 from itertools import compress
 from pathlib import Path
@@ -102,13 +101,13 @@ def read_tokens(file: Path) -> tuple[Token, ...]:
     return tokens
 
 
-def check_key_pair(cert: FilePath | None, key: FilePath | None) -> bool:
-    """Return whether there is a certificate with its key, and check both: they are loaded once.
+def check_key_pair(cert: FilePath | None, key: FilePath | None) -> None:
+    """Check a certificate and its key: load both once.
 
     Parameters
     ----------
     cert, key : path or None
-        PEM files.
+        PEM files. None for both: there is nothing to check.
 
     Raises
     ------
@@ -116,7 +115,7 @@ def check_key_pair(cert: FilePath | None, key: FilePath | None) -> bool:
         For only one of the two, for files that cannot be used, and for a key with a password.
     """
     if cert is None and key is None:
-        return False
+        return
     if cert is None or key is None:
         raise SettingError(
             "Expected a certificate and its key together (--cert and --key, or --opcua-cert and "
@@ -130,7 +129,6 @@ def check_key_pair(cert: FilePath | None, key: FilePath | None) -> bool:
         do="use PEM files, and a key without a password",
     ):
         ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER).load_cert_chain(cert, key, password="none")
-    return True
 
 
 def is_loopback(host: str) -> bool:
@@ -245,7 +243,7 @@ class Guard:
             self._check(scope)
         except HTTPException as refusal:
             response = problem_response(refusal.status_code, refusal.detail, CLOSE)
-            if refusal.status_code == HTTPStatus.UNAUTHORIZED:
+            if refusal.status_code == 401:
                 # Each has a header of its own: Chromium reads only the first scheme of a header.
                 for challenge in CHALLENGES:
                     response.headers.append("WWW-Authenticate", challenge)
@@ -268,7 +266,7 @@ class Guard:
         # A web page on another name has no token: browsers send Basic credentials by origin.
         if not self.tokens and not names_this_machine(host):
             raise HTTPException(
-                HTTPStatus.MISDIRECTED_REQUEST,
+                421,
                 "Expected the server to be called as localhost or 127.0.0.1, for it has no token.",
             )
         self._check_token(scope, headers)
@@ -278,7 +276,7 @@ class Guard:
         is_same_site = headers.get("sec-fetch-site", "none") in ("same-origin", "none")
         if scope["method"] not in SAFE_METHODS and not (is_same_origin and is_same_site):
             raise HTTPException(
-                HTTPStatus.FORBIDDEN,
+                403,
                 "Expected a request of this server's own pages, got one of another site.",
             )
         if int(headers.get("content-length", 0)) > MAX_BODY:
@@ -298,12 +296,10 @@ class Guard:
         if token is not None:
             CURRENT_TOKEN.set(token)
             if not token.operates and scope["method"] not in SAFE_METHODS:
-                raise HTTPException(
-                    HTTPStatus.FORBIDDEN, "Expected an operator's token, got a viewer's token."
-                )
+                raise HTTPException(403, "Expected an operator's token, got a viewer's token.")
         elif scope["path"] != "/healthz":
             raise HTTPException(
-                HTTPStatus.UNAUTHORIZED,
+                401,
                 "Expected the server's token: Authorization: Bearer TOKEN, or any user name with "
                 "it as the password.",
             )

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 from msgspec import Meta
+from prometheus_client import CONTENT_TYPE_LATEST
 from starlette.applications import Starlette
 from starlette.exceptions import HTTPException
 from starlette.middleware import Middleware
@@ -40,7 +41,7 @@ from .api import Json, Operation, field_types, response_fields
 from .auth import CURRENT_TOKEN, Guard, Token
 from .metrics import Metrics
 from .robot_calls import RobotCalls
-from .service import CellService, ReportResponse
+from .service import CellService, ReportResponse, ServiceResponse
 from .xmlrpc import rpc_route
 
 if TYPE_CHECKING:
@@ -104,7 +105,7 @@ class HttpApi:
         """
         # A guarantee may name a class, and no request over the network may cause an import.
         policy = field_types(Policy, "guarantee") | {"force_limits": list[str]}
-        filter_ = field_types(HistoryFilter, "label")
+        filter_ = field_types(HistoryFilter)
         return [
             Operation("POST", "/decide", self.decide, "DecideResponse", raw_parameter="trace"),
             Operation("POST", "/report", self.report, "ReportResponse"),
@@ -145,7 +146,7 @@ class HttpApi:
         ] = None,
         part: Annotated[str | int | None, Meta(description="The part's number.")] = None,
         channels: Annotated[int, Meta(ge=1, le=99_999, description="Of bytes.")] = 1,
-    ) -> Json:
+    ) -> ServiceResponse:
         """Decide on a trace. The same trace and request id get the same decision; another trace
         with that id gets 409; a trace that the engine does not take, such as one of a wrong shape,
         and an invalid id or part, get 422.
@@ -155,11 +156,7 @@ class HttpApi:
         the reason no_store. 503: the queue is full or the server is closing, and nothing was
         recorded; verify the part.
         """
-        samples = api.as_samples(trace, channels)
-        response = await self.service.decide(samples, request, part)
-        return response_fields(
-            "DecideResponse", response.decision, late=response.late, seconds=response.seconds
-        )
+        return await self.service.decide(api.as_samples(trace, channels), request, part)
 
     async def report(
         self,
@@ -338,7 +335,6 @@ class HttpApi:
 
     async def decisions(
         self,
-        label: Literal["good", "bad", "none"] | None = None,
         open_: Annotated[
             bool, Meta(description="Only verified parts whose result was not reported.")
         ] = False,
@@ -358,7 +354,7 @@ class HttpApi:
         open, label and action are ignored. 422: a value that a field cannot have, or an invalid
         `before`; 503: the queue is full, or the store cannot be read.
         """
-        selection = HistoryFilter(label=label, **where)
+        selection = HistoryFilter(**where)
         if before:
             await self._find(before)
         stored = await self.service.read(
@@ -390,8 +386,12 @@ class HttpApi:
         safe modes of the cell. 503: the queue is full, or the store cannot be read.
         """
         recipe = self.service.engine.recipe
-        by = {"seconds": 3600.0 * hours, "start": 3600.0 * start}
-        return await self.service.read(lambda store: read_course(store, recipe, N_LABELS, **by))
+        seconds = 3600.0 * hours
+        return await self.service.read(
+            lambda store: read_course(
+                store, recipe, N_LABELS, seconds=seconds, start=3600.0 * start
+            )
+        )
 
     async def embedding(self) -> PartMap:
         """Return where parts lie in the model's embedding, in two dimensions.
@@ -440,8 +440,7 @@ class HttpApi:
 
     async def metrics(self) -> Response:
         """Return the metrics for Prometheus."""
-        body, media = self._metrics.text()
-        return Response(body, media_type=media)
+        return Response(self._metrics.text(), media_type=CONTENT_TYPE_LATEST)
 
     async def healthz(self) -> Response:
         """Return whether the engine answers: ok or degraded (200), down (503). It needs no token.
@@ -454,7 +453,7 @@ class HttpApi:
         running = self.service.engine.state
         is_alive = self.service.silent_seconds < MAX_SILENT
         faults = (running.store_fault, running.retrain_fault)
-        state = "degraded" if any(faults) else "ok"
+        state: Literal["ok", "degraded", "down"] = "degraded" if any(faults) else "ok"
         if not is_alive:
             state = "down"
         health = api.Health(state, *faults, self.service.waiting)

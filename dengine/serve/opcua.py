@@ -12,9 +12,8 @@ most twice a second. The begin and the end of an alarm are events of the Server 
 
 import asyncio
 import logging
-import os
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
-from contextlib import asynccontextmanager, suppress
+from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
 
@@ -30,17 +29,14 @@ from asyncua.ua import VariantType
 from asyncua.ua.status_codes import StatusCodes
 
 from ..errors import DengineError, SettingError, TraceError, as_options, log
-from ..files import FilePath
 from .auth import Token, check_key_pair, find_token, host_in_url, is_loopback
 from .robot_calls import RobotCalls, one_line
 from .service import CellService
 
-PORT = 4840
 MAX_MESSAGE = 1 << 20  # bytes, 250,000 samples
 CHUNK = 65535  # bytes of a part of a message
 MAX_CONNECTIONS = 50
 MAX_SUBSCRIPTIONS = 100
-MAX_CHANNELS = 1000
 USER = "dengine"
 NAMESPACE = "urn:dengine:cell"
 MIN_REFRESH = 0.5  # seconds between two readings of the store
@@ -112,11 +108,11 @@ class TokenUsers(UserManager):
 @asynccontextmanager
 async def opcua_server(
     service: CellService,
-    port: int = PORT,
+    port: int,
     host: str = "127.0.0.1",
     tokens: tuple[Token, ...] = (),
-    cert: FilePath | None = None,
-    key: FilePath | None = None,
+    cert: Path | None = None,
+    key: Path | None = None,
 ) -> AsyncIterator[Server]:
     """Serve a cell over OPC UA in this event loop, as long as the context lasts.
 
@@ -152,10 +148,10 @@ async def opcua_server(
             f"Expected a token, a certificate and a key to serve OPC UA on {host}; or stay on "
             "127.0.0.1."
         )
-    is_secure = check_key_pair(cert, key)
+    check_key_pair(cert, key)
     # asyncua logs tracebacks of whatever strangers send.
     logging.getLogger("asyncua").setLevel(logging.CRITICAL)
-    server = Server(user_manager=TokenUsers(tokens, is_secure))
+    server = Server(user_manager=TokenUsers(tokens, cert is not None))
     server.limits.max_message_size = MAX_MESSAGE
     server.limits.max_chunk_count = MAX_MESSAGE // CHUNK + 1
     server.iserver.max_connections = MAX_CONNECTIONS
@@ -170,8 +166,8 @@ async def opcua_server(
     policy = ua.SecurityPolicyType.NoSecurity
     if cert is not None and key is not None:
         policy = ua.SecurityPolicyType.Basic256Sha256_SignAndEncrypt
-        await server.load_certificate(os.fspath(cert), "pem")
-        await server.load_private_key(os.fspath(key), format="pem")
+        await server.load_certificate(cert, "pem")
+        await server.load_private_key(key, format="pem")
     server.set_security_policy([policy])
     space = AddressSpace(server, service)
     await space.build()
@@ -182,8 +178,7 @@ async def opcua_server(
             yield server
         finally:
             following.cancel()
-            with suppress(asyncio.CancelledError):
-                await following
+            await asyncio.wait([following])
 
 
 class AddressSpace:
@@ -237,12 +232,11 @@ class AddressSpace:
 
         If the queue is full, or the service or its engine is closed, the result is VERIFY with an
         empty id, the reason "busy", the bounds 0 and 1, and version 0. Raises TraceError if the
-        trace is empty, if its length is not a multiple of `channels`, if `channels` is not from 1
-        to `MAX_CHANNELS`, for a trace or part that the engine does not take, and for an id of
-        another trace. Raises ReportError for an invalid id, and SettingError for a first trace that
-        the settings do not allow.
+        trace is empty, if its length is not a multiple of `channels`, for a trace or part that the
+        engine does not take, and for an id of another trace. Raises ReportError for an invalid id,
+        and SettingError for a first trace that the settings do not allow.
         """
-        if not 1 <= channels <= MAX_CHANNELS or len(trace) % channels or not trace:
+        if channels < 1 or len(trace) % channels or not trace:
             raise TraceError(
                 f"Expected as many samples of each channel, got {len(trace)} of {channels} "
                 "channels."
@@ -325,6 +319,7 @@ class AddressSpace:
         forms = [_form(_type_of(item), item.ValueRank > 0) for item in arguments]
         names = [item.Name for item in arguments]
         expected = ", ".join(map("{} ({})".format, names, forms))
+        types = [_type_of(item) for item in results]
 
         async def method(parent: ua.NodeId, *variants: ua.Variant) -> Any:
             """Check the arguments, call, and return the results; for an error write its text into
@@ -338,10 +333,7 @@ class AddressSpace:
             if given == forms:
                 try:
                     values = await call(*(item.Value for item in texts))
-                    return [
-                        ua.Variant(value, _type_of(result))
-                        for value, result in zip(values, results, strict=True)
-                    ]
+                    return list(map(ua.Variant, values, types))
                 except DengineError as error:
                     line = as_options(str(error))
                 except Exception:

@@ -20,7 +20,6 @@ from contextlib import (
     AsyncExitStack,
     closing,
     contextmanager,
-    nullcontext,
 )
 from functools import partial
 from pathlib import Path
@@ -94,8 +93,8 @@ def serve(
     make: Callable[[Executor], DataEngine],
     store: str | None,
     say: Callable[[str], object],
-    beside: Sequence[Beside] = (),
-    recorder: Callable[[], AbstractContextManager[RtdeRecorder | None]] = nullcontext,
+    beside: Sequence[Beside],
+    recorder: Callable[[], AbstractContextManager[RtdeRecorder | None]],
     *,
     host: str,
     port: int,
@@ -162,7 +161,7 @@ def serve(
             "--host 127.0.0.1."
         )
     tokens = () if token_file is None else read_tokens(token_file)
-    scheme = "https" if check_key_pair(cert, key) else "http"
+    check_key_pair(cert, key)
     if opcua is not None:
         from .opcua import opcua_server
 
@@ -184,6 +183,7 @@ def serve(
         service = CellService(lambda: make(executor), store, deadline, check_seconds=check_seconds)
         with closing(service):
             app = create_app(service, tokens, recorder=opened_recorder)
+            scheme = "http" if cert is None else "https"
             options = UVICORN_OPTIONS | {"ssl_certfile": cert, "ssl_keyfile": key}
             address = f"{scheme}://{host_in_url(host)}:{listening.getsockname()[1]}"
             audience = "" if tokens else ", to this machine alone"

@@ -20,7 +20,7 @@ import uuid
 from collections.abc import AsyncIterator, Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
@@ -61,7 +61,7 @@ class Job(NamedTuple):
 
     future: Future[Any]
     work: Callable[[DataEngine, bool], Any]
-    read_only: bool = False
+    read_only: bool
 
     def run(self, engine: DataEngine) -> None:
         """Do the work with the engine, and set the future's result or exception.
@@ -89,17 +89,15 @@ class ServiceResponse:
     ----------
     decision : Decision
         As recorded.
+    late : bool
+        Whether it is VERIFY because the deadline passed while the request waited.
     seconds : float
         From the request to the response.
     """
 
-    decision: Decision
+    decision: Decision = field(metadata={"flat": True})
+    late: bool
     seconds: float
-
-    @property
-    def late(self) -> bool:
-        """Whether the decision is VERIFY because the deadline passed while the request waited."""
-        return self.decision.reason is Reason.LATE
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,8 +164,7 @@ class CellService:
         self.check_seconds = check_seconds
         self.late = 0
         self.busy = 0
-        self.observers: list[Callable[[ServiceResponse | ReportResponse | RetrainReport], object]]
-        self.observers = []
+        self.observers: list[Callable[[Any], object]] = []
         self._jobs: queue.Queue[Job | None] = queue.Queue(max_waiting)
         # The default executor may be full of readers of a store that is unavailable.
         self._timeout_threads = ThreadPoolExecutor(max_waiting, "dengine-late")
@@ -250,7 +247,8 @@ class CellService:
             loop = asyncio.get_running_loop()
             decision = await loop.run_in_executor(self._timeout_threads, record)
             self.late += 1
-        response = ServiceResponse(decision, time.monotonic() - begin)
+        is_late = decision.reason is Reason.LATE
+        response = ServiceResponse(decision, is_late, time.monotonic() - begin)
         return self._notify_observers(response)
 
     async def report(self, decision_id: str, success: float, author: str = "") -> ReportResponse:
@@ -403,13 +401,12 @@ class CellService:
             return float("inf")
         return time.monotonic() - self._last_active
 
-    async def changes(self, quiet: float | None = None) -> AsyncIterator[bool]:
+    async def changes(self, quiet: float) -> AsyncIterator[bool]:
         """Yield True at once, and then whenever something has changed since the last yield.
 
         A change is each call of the engine that is not read-only, even if it raised, and each
-        retrain that has ended. After `quiet` seconds without a change False is yielded; None:
-        never. The iteration ends when `end_listening` is called, and yields nothing if it was
-        called before.
+        retrain that has ended. After `quiet` seconds without a change False is yielded. The
+        iteration ends when `end_listening` is called, and yields nothing if it was called before.
         """
         event = asyncio.Event()
         listener = (asyncio.get_running_loop(), event)
@@ -469,7 +466,7 @@ class CellService:
                 response.reason,
             )
         for observe in self.observers:
-            observe(response)  # type: ignore[arg-type]  # only what the list is of
+            observe(response)
         return response
 
     def _run_jobs(self, make: Callable[[], DataEngine], opened: Future[DataEngine]) -> None:
