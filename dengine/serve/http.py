@@ -355,11 +355,19 @@ class HttpApi:
         `before`; 503: the queue is full, or the store cannot be read.
         """
         selection = HistoryFilter(**where)
+        if open_:
+            selection = replace(selection, action=Action.VERIFY, label="none")
+
+        def read_newest(store: SqlStore) -> list[StoredDecision]:
+            """Return the newest decisions that were asked for, and one more if there are more."""
+            decisions = iterate_decisions(store, selection, limit + 1, before or None)
+            if open_:  # a forgotten label was reported
+                decisions = (stored for stored in decisions if stored.source is None)
+            return list(islice(decisions, limit + 1))
+
         if before:
             await self._find(before)
-        stored = await self.service.read(
-            lambda store: _read_newest(store, selection, limit + 1, before or None, open_)
-        )
+        stored = await self.service.read(read_newest)
         page = stored[:limit]
         return {
             "decisions": [response_fields("Decision", item) for item in page],
@@ -508,23 +516,6 @@ def _checked_author(author: str) -> str:
     return owner or name
 
 
-def _read_newest(
-    store: SqlStore, where: HistoryFilter, limit: int, before: str | None, unlabelled: bool
-) -> list[StoredDecision]:
-    """Return up to `limit` decisions that `where` selects, newest first, without their traces.
-
-    With `before` only decisions older than the one with this id are returned; none if the id is
-    unknown. With `unlabelled` only verified decisions whose label was never reported are returned,
-    and the action and label in `where` are ignored. A forgotten label counts as reported.
-    """
-    if unlabelled:
-        where = replace(where, action=Action.VERIFY, label="none")
-    decisions = iterate_decisions(store, where, limit, before)
-    if unlabelled:
-        decisions = (stored for stored in decisions if stored.source is None)
-    return list(islice(decisions, limit))
-
-
 def _read_explanation(store: SqlStore, id_: str) -> Json:
     """Return the explanation of a decision, named by its id or its part's number, as a JSON dict.
 
@@ -576,13 +567,14 @@ def create_app(
     Starlette
     """
     routes: list[BaseRoute] = [
-        Route(operation.path, operation.serve, methods=[operation.method])
-        for operation in HttpApi(service).operations
+        *(
+            Route(operation.path, operation.serve, methods=[operation.method])
+            for operation in HttpApi(service).operations
+        ),
+        rpc_route(RobotCalls(service, recorder)),
+        *(Route(path, _index_page) for path in VIEWS),
+        Mount("/page/static", StaticFiles(directory=STATIC)),
     ]
-    routes.append(rpc_route(RobotCalls(service, recorder)))
-    routes += [Route(path, _index_page) for path in VIEWS]
-    routes.append(Mount("/page/static", StaticFiles(directory=STATIC)))
-
     guard = Middleware(Guard, tokens=tokens)
     app = Starlette(routes=routes, middleware=[guard], exception_handlers=api.HANDLERS)
     # A robot does not follow redirects, whose target a request's Host would determine.

@@ -14,8 +14,9 @@ from inspect import signature
 from typing import Any
 
 from defusedxml.xmlrpc import DefusedExpatParser  # type: ignore[import-untyped]
+from starlette.exceptions import HTTPException
 from starlette.requests import Request
-from starlette.responses import PlainTextResponse, Response
+from starlette.responses import Response
 from starlette.routing import Route
 
 from ..errors import DengineError, ReportError, as_options, log
@@ -57,9 +58,9 @@ def rpc_route(calls: RobotCalls) -> Route:
     """Return the route of POST /RPC2, which calls the methods of `calls`."""
 
     async def rpc(request: Request) -> Response:
-        """Respond to a call with a value or a fault as XML; another media type gets 415."""
+        """Respond with a value or a fault in XML; HTTPException 415 for another media type."""
         if media_type(request) not in ("text/xml", "application/xml"):
-            return PlainTextResponse("Expected an XML-RPC call, Content-Type: text/xml.\n", 415)
+            raise HTTPException(415, "Expected an XML-RPC call, Content-Type: text/xml.")
         xml = await call_method(calls, await request.body())
         return Response(xml, media_type="text/xml")
 

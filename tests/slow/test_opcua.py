@@ -266,7 +266,12 @@ async def test_with_a_certificate_only_who_encrypts_and_knows_the_token_gets_in(
     async with opcua.opcua_server(service, 0, "127.0.0.1", TOKENS, cert, key) as server:
         encrypted = f"Basic256Sha256,SignAndEncrypt,{cert},{key}"
         assert await connect("dengine", "s3cret", encrypted) == service.engine.version
-        for user, password in (("dengine", "wrong"), ("admin", "s3cret"), ("", ""), ("dengine", "viewer")):
+        for user, password in (
+            ("dengine", "wrong"),
+            ("admin", "s3cret"),
+            ("", ""),
+            ("dengine", "viewer"),
+        ):
             with pytest.raises((ua.UaError, ConnectionError, TimeoutError)):
                 await connect(user, password, encrypted)
         # A client that does not care for what the server's endpoints are gets no session either.
