@@ -138,12 +138,13 @@ async def opcua_server(
     Raises
     ------
     SettingError
-        For an address that other machines can reach, unless there are tokens, a certificate and a
-        key; and for a certificate and a key that `check_key_pair` refuses.
+        For an address that other machines can reach, unless there are an operator's token, a
+        certificate and a key; and for a certificate and a key that `check_key_pair` refuses.
     OSError
         For a port in use.
     """
-    if not (is_loopback(host) or (cert is not None and tokens)):
+    has_password = any(token.operates for token in tokens)
+    if not (is_loopback(host) or (cert is not None and has_password)):
         raise SettingError(
             f"Expected a token, a certificate and a key to serve OPC UA on {host}; or stay on "
             "127.0.0.1."

@@ -274,7 +274,7 @@ def listening_socket(host: str, port: int) -> Iterator[socket.socket]:
         do="name another port or address, --port or --host",
     ):
         family = socket.AF_INET6 if ":" in host else socket.AF_INET
-        listening = socket.create_server((host, port), family=family, backlog=128)
+        listening = socket.create_server((host, port), family=family)
     with listening:
         # Its connections inherit this option. Without it the second piece of a response waits 40 ms
         # for the confirmation of the first.

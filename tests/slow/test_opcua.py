@@ -233,7 +233,7 @@ async def test_a_store_that_cannot_be_read_leaves_values_that_say_they_are_old(p
     "options",
     [
         {"host": "0.0.0.0"},
-        {"host": "0.0.0.0", "tokens": (Token("a token"),)},
+        {"host": "0.0.0.0", "tokens": TOKENS},
         {"host": "0.0.0.0", "cert": "c.pem", "key": "k.pem"},
         {"cert": "c.pem"},
     ],
