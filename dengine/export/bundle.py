@@ -23,7 +23,8 @@ import re
 import secrets
 import time
 import zipfile
-from dataclasses import asdict, replace
+from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -68,11 +69,10 @@ def make_key(path: FilePath) -> Path:
         file that was begun then stays.
     """
     target = Path(path)
-    flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL
     do = "name a new file in a folder that is writable; files may be signed with an old key"
     with (
         instead(ExportError, f"Cannot write {target}", OSError, do=do),
-        os.fdopen(os.open(target, flags, 0o600), "w", encoding="ascii") as file,
+        open(target, "x", encoding="ascii", opener=partial(os.open, mode=0o600)) as file,
     ):
         file.write(secrets.token_hex(32) + "\n")
         file.flush()
@@ -90,9 +90,9 @@ def signature(content: bytes, key: FilePath) -> str:
 
 
 def sibling_path(path: FilePath, suffix: str) -> Path:
-    """Return the path of a file's checksum (sha256) or signature (sig), PATH.SUFFIX.
+    """Return the path of a file's checksum (sha256), signature (sig) or head (head), PATH.SUFFIX.
 
-    `sha256sum --check` reads the former.
+    `sha256sum --check` reads the first.
     """
     return Path(f"{os.fspath(path)}.{suffix}")
 
@@ -159,7 +159,6 @@ def prepare_export(
     conditions = DecisionConditions(
         source.trace, source.force_limits, source.audit_rate, source.seed
     )
-    shape = (model.n_spaces, model.index.dim)
     examples = source.examples
     # (n, K, d), without the decider
     points = model.spaces.embed(examples) / model.scale[:, None] if len(examples) else examples
@@ -170,7 +169,7 @@ def prepare_export(
         defect = f"it does not run as TorchScript, {reason_of(error)}"
     if defect:
         raise ExportError(f"{model.name} cannot be exported: {defect}.")
-    return source, DecisionModule(source.trace, decider, shape, source.stops_all)
+    return source, DecisionModule(source.trace, decider, model.n_spaces, source.stops_all)
 
 
 def exportable(engine_or_model: Any, trace: TraceSpec | None = None) -> Exportable:
@@ -180,33 +179,28 @@ def exportable(engine_or_model: Any, trace: TraceSpec | None = None) -> Exportab
     audits, the seed, the force limits, the version, the recipe, eight labelled traces, and a
     function that records events; of a model alone, which has none of these, it has some of the
     traces it was trained on. The model is not copied, and goes on learning. `trace` replaces the
-    `TraceSpec` of the engine or the model. If an `Exportable` is given, it is returned as it is,
-    and `trace` is ignored. Raises ExportError before the first training, for a baseline, and if the
-    engine's store was changed from outside; StoreError if it cannot be read. A damaged trace is
-    left out, and noted as an event in the store.
+    `TraceSpec` of the engine or the model. Raises ExportError before the first training, for a
+    baseline, and if the engine's store was changed from outside; StoreError if it cannot be read. A
+    damaged trace is left out, and noted as an event in the store.
     """
-    if isinstance(engine_or_model, Exportable):
-        return engine_or_model
     engine = engine_or_model if isinstance(engine_or_model, DataEngine) else None
-    model = engine_or_model
-    if engine is not None:
-        error = engine.state.integrity_error
-        if error:
-            raise ExportError(f"Expected a store as it was written, to export from: {error}")
-        trace = trace or engine.trace
-        model = engine.model
-    if model is None or (isinstance(model, ModelPrediction) and not hasattr(model, "trace_shape")):
-        raise ExportError(NOT_TRAINED)
-    if not isinstance(model, ModelPrediction):
+    model = engine_or_model if engine is None else engine.model
+    if engine is not None and engine.state.integrity_error:
+        raise ExportError(
+            f"Expected a store as it was written, to export from: {engine.state.integrity_error}"
+        )
+    if model is not None and not isinstance(model, ModelPrediction):
         raise ExportError(
             f"Expected a DataEngine or a ModelPrediction to export, got {type(model).__name__}; a "
             "baseline stays in Python."
         )
-    source = Exportable(model, trace or model.trace_spec, examples=model.examples)
+    if model is None or not hasattr(model, "trace_shape"):
+        raise ExportError(NOT_TRAINED)
     if engine is None:
-        return source
-    return replace(
-        source,
+        return Exportable(model, trace or model.trace_spec, examples=model.examples)
+    return Exportable(
+        model,
+        trace or engine.trace or model.trace_spec,
         audit_rate=engine.policy.audited_share,
         seed=engine.seed,
         stops_all=engine.policy.stops == "all",
@@ -339,12 +333,11 @@ def read_checked(path: Path, key: FilePath | None = None) -> bytes:
         in PATH.sha256. With a key also if the key or the signature is missing or unreadable, or the
         content was not signed with this key.
     """
-    _read(path, most=0)  # if both are missing, the error names the file itself
+    content = _read(path)
     expected = _first_word(_read(sibling_path(path, "sha256"), SUM_BYTES))
     if not SHA256.fullmatch(expected):
         problem = f"{path}.sha256 holds no SHA-256 sum of {path.name}"
         raise ExportError(f"{problem}; copy it again together with {path.name}.")
-    content = _read(path)
     digest = hashlib.sha256(content).hexdigest()
     if digest != expected:
         raise ExportError(
@@ -365,7 +358,7 @@ def read_checked(path: Path, key: FilePath | None = None) -> bytes:
 
 def _first_word(content: bytes) -> str:
     """Return the sum or the signature at the start of a line, "" of an empty one."""
-    return (content.decode("utf-8", errors="replace").split() or [""])[0]
+    return content.decode("utf-8", errors="replace").partition(" ")[0].strip()
 
 
 def _read(path: Path, most: int = -1) -> bytes:

@@ -16,7 +16,6 @@ it is left out. A line that fits its checksum was written by a cell. If it canno
 example because its traces have another shape, DataError is raised and names the line.
 """
 
-import os
 import zlib
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
@@ -32,6 +31,7 @@ from ..recipe import Recipe
 from ..records import Action, Decision, Reason, TraceArray, TraceSpec, stored_trace_spec
 from ..store.opening import opening
 from ..traces import as_trace
+from .bundle import sibling_path
 
 if TYPE_CHECKING:
     from ..store.opening import StoreLike
@@ -72,7 +72,7 @@ class CellJournal:
     lines : list of JournalLine
         Accepted parts and labelled parts, in the order in which their outcomes became known.
     pending : JournalLine or None
-        The last part, if it was accepted and its outcome is not known; also the last of `lines`.
+        The last part, if its outcome is not known; the last of `lines` if it was accepted.
     sum : str
         SHA-256 of the export that the journal belongs to.
     cut : int
@@ -129,7 +129,7 @@ def read_journal(path: FilePath, spec: TraceSpec) -> CellJournal:
         )
     lines: list[JournalLine] = []
     parts: dict[str, JournalLine] = {}  # by id, with the label so far
-    unlabelled: list[JournalLine] = []  # the part decided last, until its label comes
+    pending: JournalLine | None = None  # the part decided last, until its label comes
     set_aside = ""
     crc = zlib.crc32(rows[0])
     crcs = [crc]
@@ -157,24 +157,24 @@ def read_journal(path: FilePath, spec: TraceSpec) -> CellJournal:
                 line = replace(parts[words[0]], label=LABELS[words[1]])
         if kind == "part":
             # Only when the next part comes is an accepted one of unknown outcome counted.
-            lines += unlabelled
-            unlabelled = [line] if line.label is None else []
+            lines += filter(None, [pending])
+            pending = line if line.label is None else None
+        elif pending is not None and pending.decision.id == line.decision.id:
+            pending = None
         else:
-            is_late = line.decision.id not in [earlier.decision.id for earlier in unlabelled]
-            line = replace(line, late=is_late)
-            unlabelled = unlabelled if is_late else []
+            line = replace(line, late=True)
         parts[line.decision.id] = line
-        lines += [line] if line.label is not None else []
-    accepted = [line for line in unlabelled if line.decision.action is Action.ACCEPT]
+        if line.label is not None:
+            lines.append(line)
     lines = [
         line
-        for line in [*lines, *unlabelled]
+        for line in filter(None, [*lines, pending])
         if line.label is not None or line.decision.action is Action.ACCEPT
     ]
     if not lines:
         raise DataError(set_aside or f"{path} holds no labels yet.")
     set_aside = set_aside or _missing_at_end(path, crcs)
-    return CellJournal(lines, next(iter(accepted), None), head[3], len(tail), set_aside)
+    return CellJournal(lines, pending, head[3], len(tail), set_aside)
 
 
 def _missing_at_end(path: FilePath, crcs: list[int]) -> str:
@@ -184,7 +184,7 @@ def _missing_at_end(path: FilePath, crcs: list[int]) -> str:
     `crcs` are the checksums of the journal's lines, the first line included. If the head is missing
     or cannot be read, a warning is logged and "" is returned.
     """
-    head = Path(f"{os.fspath(path)}.head")
+    head = sibling_path(path, "head")
     risk = "lines may have been removed at its end, or lost with the power."
     try:
         number, crc = head.read_text(encoding="ascii").split()

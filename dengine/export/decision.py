@@ -1,8 +1,10 @@
 """The module inside an exported file: `DecisionModule`, a `Decider` that also learns from reported
 outcomes. It decides as `DataEngine.decide` does, and learns as `DataEngine.report` does between two
 retrains. `bundle.prepare_export` builds it; TorchScript compiles it; `ExportedModel` and the C++
-program call the methods in `METHODS`.
+program call the exported methods.
 """
+
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -14,19 +16,35 @@ from ..traces import can_fit_length, fit_length
 # action, reason, lower, upper, n_success, n_failure, embedding
 DecisionFields = tuple[int, int, float, float, int, int, Tensor]
 FIELDS = ("action", "reason", "lower", "upper", "n_success", "n_failure", "embedding")
-METHODS = (
-    "forward",
-    "decide",
-    "learn",
-    "stop",
-    "settle",
-    "safe_mode",
-    "restore",
-    "predicted",
-    "drop",
-    "n_references",
-)
-NONE_PENDING = -1  # in place of an action: no decision is pending
+
+
+class DecidedTrace(NamedTuple):
+    """What `DecisionModule` keeps of a decision until the outcome of the part is known.
+
+    Attributes
+    ----------
+    action, predicted : int
+        `ActionCode`s (0 verify, 1 accept, 2 reject): what was decided, and what the model alone
+        would have done.
+    part : int
+        Hash of the part; 0 for an unknown part.
+    content : int
+        Hash of the content of the trace.
+    reason : int
+        Position in `Reason`.
+    lower, upper : float
+        Bound on the success probability.
+    embedding : Tensor of float32, shape (K, d)
+    """
+
+    action: int
+    predicted: int
+    part: int
+    content: int
+    reason: int
+    lower: float
+    upper: float
+    embedding: Tensor
 
 
 class DecisionModule(nn.Module):
@@ -42,35 +60,28 @@ class DecisionModule(nn.Module):
         Shape of the traces, and how other lengths are fitted to it.
     decider : Decider
         Eager or compiled; its predictor has `neighbours`, like `model.neighbours.Predictor`.
-    embedding_shape : pair of int
-        (K, d).
+    n_spaces : int
+        K, the number of embedding spaces.
     stops_all : bool, default False
         Whether the next `decide` confirms an accepted part of which nothing was reported.
 
     Attributes
     ----------
-    pending_action : int
-        Action of the decision whose outcome is not yet reported, or `NONE_PENDING`.
-    pending_predicted : int
-        What the model alone would have done.
-    pending_part, pending_content : int
-        Hash of its part (or of its content if the part is unknown), and of its content.
-    pending_novel : bool
-        Whether its trace was novel.
-    pending_lower, pending_upper : float
-        Its bound.
-    pending_embedding : Tensor of float32, shape (K, d)
+    pending : DecidedTrace or None
+        The decision whose outcome is not yet reported.
+    last_predicted : int
+        What the model alone would have done with the trace decided last.
     n_unreported : int
         Number of accepted parts since the last label; their outcomes stay unknown.
     """
 
-    pending_embedding: Tensor
+    pending: DecidedTrace | None
 
     def __init__(
         self,
         spec: TraceSpec,
         decider: Decider,
-        embedding_shape: tuple[int, int],
+        n_spaces: int,
         stops_all: bool = False,
     ) -> None:
         super().__init__()
@@ -78,22 +89,14 @@ class DecisionModule(nn.Module):
         self.channels = spec.channels
         self.samples = spec.samples
         self.fit = FITS.index(spec.fit)
-        self.n_spaces = embedding_shape[0]
+        self.n_spaces = n_spaces
         self.stops_all = stops_all
         self.audit_reason = REASONS.index(Reason.AUDIT)
         self.novel_reason = REASONS.index(Reason.NOVEL)
         self.outside_reason = REASONS.index(Reason.OUTSIDE)
-        self.none_pending = NONE_PENDING
-        # Plain attributes: assigned to an element of a tensor, a float would go through float32.
-        self.pending_action = NONE_PENDING
-        self.pending_predicted = 0
-        self.pending_part = 0
-        self.pending_content = 0
-        self.pending_novel = False
-        self.pending_lower = 0.0
-        self.pending_upper = 1.0
+        self.pending = None
+        self.last_predicted = ActionCode.VERIFY.value
         self.n_unreported = 0
-        self.register_buffer("pending_embedding", torch.zeros(embedding_shape))
 
     @torch.jit.export
     def decide(self, trace: Tensor, part: int = 0) -> DecisionFields:
@@ -131,42 +134,17 @@ class DecisionModule(nn.Module):
         (
             fault, content, action, predicted, reason, lower, upper, n_success, n_failure, z, _,
         ) = self.decider(x, part)  # fmt: skip
-        pending = action if fault == 0 else self.none_pending
-        self.set_pending(pending, predicted, part, content, reason, lower, upper, z)
+        self.last_predicted = predicted
+        self.pending = None
+        if fault == 0:
+            self.pending = DecidedTrace(
+                action, predicted, part, content, reason, lower, upper, z.clone()
+            )
         return action, reason, lower, upper, n_success, n_failure, z
 
     def forward(self, trace: Tensor, part: int = 0) -> DecisionFields:
         """Call `decide`, by the name under which `torch.jit.load` calls a module."""
         return self.decide(trace, part)
-
-    def set_pending(
-        self,
-        action: int,
-        predicted: int,
-        part: int,
-        content: int,
-        reason: int,
-        lower: float,
-        upper: float,
-        z: Tensor,
-    ) -> None:
-        """Make this decision the pending one: the one whose outcome is not reported yet.
-
-        An earlier pending decision is discarded. `action` and `predicted`, what the model alone
-        would have done, are `ActionCode`s (0 verify, 1 accept, 2 reject); `lower` and `upper` are
-        the bound on the success probability, and z (K, d), which is copied, is the embedding.
-        `action` is `NONE_PENDING` (-1) for a faulty trace; then no decision is pending. `part` is
-        the hash of the part; if it is 0, the part is unknown, and the hash `content` of the trace
-        takes its place. Whether the trace was novel is read from `reason`, a position in `Reason`.
-        """
-        self.pending_action = action
-        self.pending_predicted = predicted
-        self.pending_part = part if part != 0 else content
-        self.pending_content = content
-        self.pending_novel = reason == self.novel_reason
-        self.pending_lower = lower
-        self.pending_upper = upper
-        self.pending_embedding.copy_(z)
 
     @torch.jit.export
     def learn(self, trace: Tensor, success: bool, part: int = 0) -> int:
@@ -201,22 +179,16 @@ class DecisionModule(nn.Module):
         x = self.as_trace(trace)
         fault, content = self.decider.check(x)
         if fault == 0:
-            part_or_content = part if part != 0 else content
-            is_pending = self.pending_action != self.none_pending
-            if (
-                is_pending
-                and self.pending_part == part_or_content
-                and self.pending_content == content
-            ):
-                self.learn_pending(success)
+            pending = self.pending
+            if pending is not None and pending.part == part and pending.content == content:
+                self.learn_outcome(pending, success)
+                self.pending = None
             else:
                 (
                     _, _, action, predicted, reason, lower, upper, _, _, z, _,
                 ) = self.decider(x, part)  # fmt: skip
-                novel = reason == self.novel_reason
-                self.learn_outcome(
-                    lower, upper, novel, z, part_or_content, success, action, predicted
-                )
+                decided = DecidedTrace(action, predicted, part, content, reason, lower, upper, z)
+                self.learn_outcome(decided, success)
         return self.n_references()
 
     @torch.jit.export
@@ -237,19 +209,20 @@ class DecisionModule(nn.Module):
         decision is pending. If the pending decision is no accept, or there is none, nothing
         changes.
         """
-        if self.pending_action != ActionCode.ACCEPT.value:
+        pending = self.pending
+        if pending is None or pending.action != ActionCode.ACCEPT.value:
             return False
+        self.pending = None
         if self.stops_all:
-            self.learn_pending(True)
+            self.learn_outcome(pending, True)
             return True
         self.n_unreported += 1
-        self.pending_action = self.none_pending
         return False
 
     @torch.jit.export
     def drop(self) -> None:
         """Discard the pending decision: its part was not passed on, its outcome stays unknown."""
-        self.pending_action = self.none_pending
+        self.pending = None
 
     @torch.jit.export
     def restore(
@@ -268,12 +241,14 @@ class DecisionModule(nn.Module):
         x = self.as_trace(trace)
         self.settle()
         fault, content = self.decider.check(x)
-        pending = action if fault == 0 else self.none_pending
         predicted = 0 if reason == self.outside_reason else action
         if reason == self.audit_reason:
             predicted = self.decider.predictor.neighbours.rule.action(lower, upper)
-        z = self.decider.predictor.embed(x)
-        self.set_pending(pending, predicted, part, content, reason, lower, upper, z)
+        self.last_predicted = predicted
+        self.pending = None
+        if fault == 0:
+            z = self.decider.predictor.embed(x)
+            self.pending = DecidedTrace(action, predicted, part, content, reason, lower, upper, z)
 
     @torch.jit.export
     def predicted(self) -> int:
@@ -281,7 +256,7 @@ class DecisionModule(nn.Module):
 
         It differs from the action in an audit, and if a force limit rejects.
         """
-        return self.pending_predicted
+        return self.last_predicted
 
     @torch.jit.export
     def safe_mode(self) -> int:
@@ -295,55 +270,29 @@ class DecisionModule(nn.Module):
         n_references: int = self.decider.predictor.neighbours.references.size()
         return n_references
 
-    def learn_pending(self, success: bool) -> None:
-        """Learn the outcome of the pending decision; afterwards no decision is pending.
-
-        The decision rule is updated, and the trace becomes a reference with the label `success`, as
-        in `learn_outcome`. It is not checked whether a decision is pending.
-        """
-        self.learn_outcome(
-            self.pending_lower,
-            self.pending_upper,
-            self.pending_novel,
-            self.pending_embedding,
-            self.pending_part,
-            success,
-            self.pending_action,
-            self.pending_predicted,
-        )
-        self.pending_action = self.none_pending
-
-    def learn_outcome(
-        self,
-        lower: float,
-        upper: float,
-        novel: bool,
-        z: Tensor,
-        part: int,
-        success: bool,
-        action: int,
-        predicted: int,
-    ) -> None:
+    def learn_outcome(self, decided: DecidedTrace, success: bool) -> None:
         """Update the decision rule with an outcome, and make the trace a reference.
 
-        `success` is the label, and z (K, d) the embedding of the trace. `lower` and `upper` (the
-        bound), `novel` (whether the trace was novel), `action` and `predicted` (what the model
-        alone would have done; `ActionCode`s) are those of the decision, from before the label was
-        known. `part` is the hash of the part; it also gives the part's fold k, and the reference is
-        put into embedding space k. The rule gets as inclusion probability the audit rate if the
-        part was audited, 1 if it was verified for another reason, and 0 if it was accepted or
-        rejected. It also gets `n_unreported`, the number of accepted parts without a report since
-        the last label, which restarts at 0. If the index is full, its oldest reference is dropped.
+        `decided` is the decision, from before the label was known, and `success` the label. The
+        hash of the part (of the content of its trace, if the part is unknown) gives the part's fold
+        k, and the reference is put into embedding space k. The rule gets as inclusion probability
+        the audit rate if the part was audited, 1 if it was verified for another reason, and 0 if it
+        was accepted or rejected. It also gets `n_unreported`, the number of accepted parts without
+        a report since the last label, which restarts at 0. If the index is full, its oldest
+        reference is dropped.
         """
         inclusion_probability = 0.0
-        if action == ActionCode.VERIFY.value:
+        if decided.action == ActionCode.VERIFY.value:
             audit_rate = float(self.decider.audit_rate.item())
-            inclusion_probability = 1.0 if predicted == action else audit_rate
+            inclusion_probability = 1.0 if decided.predicted == decided.action else audit_rate
         neighbours = self.decider.predictor.neighbours
-        neighbours.rule.observe(self.n_unreported, novel)
-        neighbours.rule.update(lower, upper, success, predicted, inclusion_probability)
+        neighbours.rule.observe(self.n_unreported, decided.reason == self.novel_reason)
+        neighbours.rule.update(
+            decided.lower, decided.upper, success, decided.predicted, inclusion_probability
+        )
+        part = decided.part if decided.part != 0 else decided.content
         space = self.decider.toss(part) % self.n_spaces
-        neighbours.references.put(z[space], 1.0 if success else 0.0, space, part)
+        neighbours.references.put(decided.embedding[space], 1.0 if success else 0.0, space, part)
         self.n_unreported = 0
 
     def as_trace(self, trace: Tensor) -> Tensor:

@@ -16,10 +16,9 @@ a reference that is asked about itself counts itself.
 import json
 import logging
 import warnings
-from importlib import import_module
 from importlib.util import find_spec
+from operator import attrgetter
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -51,10 +50,12 @@ from .torchscript import TOLERANCE, ExportedDecision, golden_trace
 NEEDED = ("onnx", "onnxruntime", "onnxscript")
 FAR = 1e9  # a coordinate that no radius reaches
 OPSET = 18
+NOT_COUNTED = (0, 0.0, 1.0, 0, 0)  # action, bound and labels of a faulty or a novel trace
 N_CHECKED = 64  # random traces that a file is checked on before it is kept
 BOUND_TOLERANCE = 1e-6
 # References whose distance is the radius may fall on either side: runtimes add in another order.
 N_AT_EDGE = 2
+NUMBERS = attrgetter("lower", "upper", "n_success", "n_failure")
 
 
 def export_onnx(
@@ -108,18 +109,19 @@ def export_onnx(
     StoreError, OSError
         As in `prepare_export` and `write_export`.
     """
-    onnx = _import_package("onnx")
+    _require_packages()
+    import onnx
+
     source, _ = prepare_export(engine_or_model, trace, path, force)
     _refuse_unsupported(source)
     metadata = describe(source) | {"format": "onnx", "learns": False}
     program = _to_onnx(OnnxDecision(source).eval(), source.trace)
+    onnx_model = OnnxModel(program.SerializeToString(), metadata)
+    _check_decisions(onnx_model, source.model, source.trace)
     x = golden_trace(source.trace)
-    embedding = OnnxModel(program.SerializeToString(), metadata).decide(x).embedding
-    golden = {"trace": x.tolist(), "embedding": embedding.tolist()}
+    golden = {"trace": x.tolist(), "embedding": onnx_model.decide(x).embedding.tolist()}
     onnx.helper.set_model_props(program, {METADATA: json.dumps(metadata | {"golden": golden})})
-    content = program.SerializeToString()
-    _check_decisions(OnnxModel(content, metadata), source.model, source.trace)
-    return write_export(path, content, force, key, source)
+    return write_export(path, program.SerializeToString(), force, key, source)
 
 
 def load_onnx(path: FilePath, *, key: FilePath | None = None) -> "OnnxModel":
@@ -145,7 +147,9 @@ def load_onnx(path: FilePath, *, key: FilePath | None = None) -> "OnnxModel":
         file that is no ONNX export, has another schema or is refused by onnxruntime, and if a
         package for ONNX is missing.
     """
-    onnx = _import_package("onnx")
+    _require_packages()
+    import onnx
+
     target = Path(path)
     content = read_checked(target, key)
     with instead(
@@ -197,12 +201,14 @@ class OnnxModel:
     """
 
     def __init__(self, content: bytes, metadata: Metadata) -> None:
-        runtime = _import_package("onnxruntime")
-        options = runtime.SessionOptions()
+        _require_packages()
+        import onnxruntime
+
+        options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = options.inter_op_num_threads = 1
         options.log_severity_level = 3
         providers = ["CPUExecutionProvider"]
-        self.session = runtime.InferenceSession(content, options, providers=providers)
+        self.session = onnxruntime.InferenceSession(content, options, providers=providers)
         self.metadata = metadata
         self.trace = TraceSpec(**metadata["trace"])
         self.decide(golden_trace(self.trace))  # warms it up
@@ -264,19 +270,16 @@ class OnnxDecision(nn.Module):
         is_counted = is_sound & is_usual
         # (n,): a reference is nearest in its own space
         distances = (self.points - z[:, :, None]).square().sum(1).amin(0)
-        action, lower, upper, n_success, n_failure = self.count(distances)
-        zero = torch.zeros_like(action)
-        empty = torch.zeros_like(lower)
-        action = torch.where(is_counted, action, zero)
+        action, *numbers = [
+            torch.where(is_counted, value, otherwise)
+            for value, otherwise in zip(self.count(distances), NOT_COUNTED, strict=True)
+        ]
         certainty = torch.where(action == 0, UNCERTAIN, CERTAIN)
         reason = torch.where(is_usual, certainty, NOVEL)
         return (
             action,
             torch.where(is_sound, reason, fault),
-            torch.where(is_counted, lower, empty),
-            torch.where(is_counted, upper, empty + 1.0),
-            torch.where(is_counted, n_success, zero),
-            torch.where(is_counted, n_failure, zero),
+            *numbers,
             torch.where(is_sound, z, float("nan")),
         )
 
@@ -290,9 +293,9 @@ class OnnxDecision(nn.Module):
         high = trace.max()
         is_finite = (trace.abs() < float("inf")).all()
         highest = torch.maximum(high, -low)
-        too_large = torch.where(highest > LARGEST, TOO_LARGE, 0)
-        out_of_range = torch.where(highest >= self.limit, SATURATED, too_large)
-        fault = torch.where(low == high, CONSTANT, out_of_range)
+        fault = torch.where(highest > LARGEST, TOO_LARGE, 0)
+        fault = torch.where(highest >= self.limit, SATURATED, fault)
+        fault = torch.where(low == high, CONSTANT, fault)
         return torch.where(is_finite, fault, NOT_FINITE)
 
     def count(self, distances: Tensor) -> tuple[Tensor, ...]:
@@ -303,8 +306,8 @@ class OnnxDecision(nn.Module):
         (`lower`, `upper`) by the paper's rule. A reference at the radius counts.
         """
         is_inside = distances <= self.radius * self.radius
-        n_success = (is_inside & (self.labels == 1)).to(torch.int64).sum()
-        n_failure = (is_inside & (self.labels == 0)).to(torch.int64).sum()
+        n_success = (is_inside & (self.labels == 1)).sum()
+        n_failure = (is_inside & (self.labels == 0)).sum()
         limits = ARRAY_LIMITS[self.rule.interval]
         lower, upper = limits(torch, n_success.double(), n_failure.double(), self.rule.z)
         rejects = torch.where(upper <= self.rule.reject_threshold, 2, 0)
@@ -354,24 +357,18 @@ def _check_decisions(onnx_model: OnnxModel, model: Any, spec: TraceSpec) -> None
         X = np.clip(X, -0.9 * spec.limit, 0.9 * spec.limit)
     for actual, expected in zip(map(onnx_model.decide, X), model.predict_many(X), strict=True):
         is_near = np.allclose(actual.embedding, expected.embedding, rtol=TOLERANCE, atol=TOLERANCE)
-        n_moved = abs(actual.n_success - expected.n_success) + abs(
-            actual.n_failure - expected.n_failure
-        )
-        difference = abs(actual.lower - expected.lower) + abs(actual.upper - expected.upper)
-        same_counts = actual.action == expected.action and difference <= BOUND_TOLERANCE
-        if not is_near or n_moved > N_AT_EDGE or (n_moved == 0 and not same_counts):
+        differences = np.abs(np.subtract(NUMBERS(actual), NUMBERS(expected)))
+        n_moved = differences[2:].sum()
+        is_same = actual.action == expected.action and differences.sum() <= BOUND_TOLERANCE
+        if not is_near or n_moved > N_AT_EDGE or (n_moved == 0 and not is_same):
             raise ExportError(
                 f"onnxruntime does not decide as the model does: {actual} for {expected}; export "
                 "torchscript."
             )
 
 
-def _import_package(name: str) -> ModuleType:
-    """Import and return the package `name`: "onnx", "onnxruntime" or "onnxscript".
-
-    Raises ExportError, with what to install, if any of these three packages is missing.
-    """
+def _require_packages() -> None:
+    """Raise ExportError, with what to install, if a package for ONNX is missing."""
     missing = [needed for needed in NEEDED if find_spec(needed) is None]
     if missing:
         raise ExportError(f"ONNX needs {', '.join(missing)}; pip install dengine[onnx].")
-    return import_module(name)

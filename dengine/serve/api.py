@@ -15,9 +15,9 @@ from dataclasses import dataclass, field, fields, is_dataclass
 from functools import cache, cached_property, reduce
 from http import HTTPStatus
 from inspect import Parameter, getdoc, signature
-from operator import or_
+from operator import methodcaller, or_
 from types import UnionType
-from typing import Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
 import msgspec
 import numpy as np
@@ -44,10 +44,11 @@ from ..errors import (
 from ..history.explain import Explanation
 from ..history.map import PartMap
 from ..history.status import Course, Status
-from ..records import Action, Decision, TraceArray
+from ..records import Action, TraceArray
 from ..representation import to_jsonable
 from ..store.records import Correction, Event, StoredDecision, StoredVersion, VersionError
-from .service import ReportResponse
+from ..traces import LARGEST
+from .service import ReportResponse, ServiceResponse
 
 T = TypeVar("T")
 Json = dict[str, Any]
@@ -64,34 +65,11 @@ REF = "#/components/schemas/{name}"
 Samples = list[float | list[float | None] | None]
 
 # Bytes are taken for float64 from so many words on, if this share of all words are low halves that
-# are larger, by this factor, than the largest high half.
+# are larger than a sample can be.
 MIN_WORDS = 32
-LARGE_FACTOR = 1e9
 LARGE_SHARE = 0.025
 
 # Requests
-
-
-class Refusal(Exception):  # noqa: N818  # a response, not an error
-    """Raised to answer a request with an HTTP error; `problem_response` makes the response.
-
-    A handler, the method that answers a request, raises it; so does what reads a request.
-
-    Parameters
-    ----------
-    status : int
-        HTTP status.
-    detail : str
-        What was expected, what came, what to do.
-    headers : mapping, optional
-        Further headers of the response.
-    """
-
-    def __init__(self, status: int, detail: str, headers: Mapping[str, str] | None = None) -> None:
-        super().__init__(detail)
-        self.status = status
-        self.detail = detail
-        self.headers = dict(headers or {})
 
 
 def field_types(record: type, *without: str) -> Json:
@@ -114,10 +92,8 @@ def _request_type(handler: Callable[..., Any], optional_fields: Json) -> type[St
     for name, parameter in signature(handler).parameters.items():
         if parameter.kind is Parameter.VAR_KEYWORD:
             continue
-        if parameter.default is Parameter.empty:
-            members.append((name, hints[name]))
-        else:
-            members.append((name, hints[name], parameter.default))
+        default = () if parameter.default is Parameter.empty else (parameter.default,)
+        members.append((name, hints[name], *default))
     members += [(name, hint | UnsetType, UNSET) for name, hint in optional_fields.items()]
     return msgspec.defstruct(
         f"{handler.__name__.capitalize()}Request",
@@ -136,23 +112,14 @@ def media_type(request: Request) -> str:
     return request.headers.get("content-type", "").partition(";")[0].strip().lower()
 
 
-async def read_body(request: Request, struct_type: type[T], *other_types: str) -> T:
+async def read_body(request: Request, struct_type: type[T]) -> T:
     """Decode a request's JSON body into a struct of `struct_type`, and return the struct.
 
-    The body is an object without nested objects. Raises Refusal: 415 for another media type than
-    JSON, 400 for a body that is no JSON or has a name twice, 422 for fields that the type does not
-    take. The message of 415 also lists `other_types`, the media types that the caller reads itself.
-    Raises ClientDisconnect if the client goes away before the whole body has come, and Refusal 413
-    while it is read, if `Guard` finds it too large.
+    The body is an object without nested objects. Raises HTTPException: 400 for a body that is no
+    JSON or has a name twice, 422 for fields that the type does not take. Raises ClientDisconnect if
+    the client goes away before the whole body has come, and HTTPException 413 while it is read, if
+    `Guard` finds it too large.
     """
-    media = media_type(request)
-    if media != JSON:
-        accepted = ", ".join((JSON, *other_types))
-        raise Refusal(
-            415,
-            f"Expected a body of {accepted}, got {shortened(media)}.",
-            {"Accept": accepted},
-        )
     body = await request.body()
     try:
         decoded = msgspec.json.decode(body, type=struct_type)
@@ -160,13 +127,13 @@ async def read_body(request: Request, struct_type: type[T], *other_types: str) -
         # msgspec takes a text for bytes in base64; whoever sends one knows nothing of that.
         wanted = "Expected lists of numbers, or raw float32 in base64, got a text"
         text = str(error).replace("Invalid base64 encoded string", wanted)
-        raise Refusal(422, f"{text}.") from error
+        raise HTTPException(422, f"{text}.") from error
     except (ValueError, RecursionError) as error:
-        raise Refusal(400, f"Expected {JSON}: {error}.") from error
+        raise HTTPException(400, f"Expected {JSON}: {error}.") from error
     # msgspec takes the last of two equal keys.
     n_keys = sum(map(bool, STRINGS.findall(body)))
     if n_keys != len(msgspec.json.decode(body, type=dict[str, msgspec.Raw])):
-        raise Refusal(400, "Expected each name once, got one twice.")
+        raise HTTPException(400, "Expected each name once, got one twice.")
     return decoded
 
 
@@ -174,8 +141,8 @@ def read_query(request: Request, struct_type: type[T], **body: bytes) -> T:
     """Convert the query of a request and the parameters in its path to a struct of `struct_type`.
 
     If the body is bytes, `body` has these bytes under the name of the field that gets them. Texts
-    are converted to the types of the fields. Raises Refusal 422 for an unknown name, a name that
-    comes twice, a missing field and a wrong value.
+    are converted to the types of the fields. Raises HTTPException 422 for an unknown name, a name
+    that comes twice, a missing field and a wrong value.
     """
     pairs = [*request.query_params.multi_items(), *request.path_params.items(), *body.items()]
     try:
@@ -183,7 +150,7 @@ def read_query(request: Request, struct_type: type[T], **body: bytes) -> T:
             raise ValueError("Expected each name of the query once")
         return msgspec.convert(dict(pairs), struct_type, strict=False)
     except ValueError as error:
-        raise Refusal(422, f"{error}, in the query.") from error
+        raise HTTPException(422, f"{error}, in the query.") from error
 
 
 def as_samples(value: Any, channels: int = 1) -> TraceArray:
@@ -242,20 +209,16 @@ def _look_like_float64(words: NDArray[np.float32]) -> bool:
 
     The low half of a float64 number, the words at even positions, is the end of its fraction:
     random bits, or zeros. So the result is True if all low halves are zero and some high half is
-    not. It is also True if many low halves, at least `LARGE_SHARE` of all words, are, without their
-    sign, more than `LARGE_FACTOR` times as large as the largest high half, or as 1 if that is
-    larger; words that are not finite do not count. It is False for fewer than `MIN_WORDS` words and
-    for an odd number.
+    not, as for whole numbers. It is also True if many low halves, at least `LARGE_SHARE` of all
+    words, are beyond `LARGEST`, which no sample may be; words that are not finite do not count. It
+    is False for fewer than `MIN_WORDS` words and for an odd number.
     """
     if len(words) % 2 or len(words) < MIN_WORDS:
         return False
     low = words[0::2]
-    high = words[1::2]
-    if not low.view(np.uint32).any():  # whole numbers, or halves of them
-        return bool(high.view(np.uint32).any())
-    low = low[np.isfinite(low)]
-    largest = np.float64(np.abs(high[np.isfinite(high)]).max(initial=1.0))
-    n_large = int((np.abs(low) > LARGE_FACTOR * largest).sum())
+    if not low.any():
+        return bool(words.any())
+    n_large = int(((np.abs(low) > LARGEST) & np.isfinite(low)).sum())
     return n_large >= LARGE_SHARE * len(words)
 
 
@@ -274,8 +237,7 @@ def _response_type(
     """
     members = _json_field_types(record) if record else {}
     types = {key: hint for key, hint in members.items() if key not in without}
-    docs = [about, (getdoc(record) or "") if record else ""]
-    doc = "\n\n".join(filter(None, docs))
+    doc = "\n\n".join(filter(None, [about, getdoc(record) if record else None]))
     return msgspec.defstruct(name, (types | more).items(), namespace={"__doc__": doc}, kw_only=True)
 
 
@@ -321,7 +283,7 @@ def _described(hint: Any, text: str) -> Any:
 class Health(Struct):
     """Whether the engine answers."""
 
-    status: Annotated[str, Meta(extra_json_schema={"enum": ["ok", "degraded", "down"]})]
+    status: Literal["ok", "degraded", "down"]
     store_fault: Annotated[str, Meta(description="Why the store cannot be written, or empty.")]
     retrain_fault: Annotated[
         str, Meta(description="Why retrains are dropped again and again, or empty.")
@@ -374,7 +336,6 @@ DecisionResponse: Any = _response_type(
     "A decision with its label.",
     StoredDecision,
     without=("content_hash",),  # JavaScript has no integers of 64 bits
-    trace=_described(Traces | None, "Null unless it was requested."),
 )
 RESPONSES = {
     response.__name__: response
@@ -382,7 +343,7 @@ RESPONSES = {
         _response_type(
             "DecideResponse",
             "The response to a trace.",
-            Decision,
+            ServiceResponse,
             late=_described(bool, "The deadline passed; recorded as VERIFY."),
             seconds=_described(float, "From the request to the response, in the server."),
         ),
@@ -439,14 +400,11 @@ def json_response(
 ) -> Response:
     """Return an HTTP response with `body` as JSON; a number that is not finite becomes null.
 
-    NumPy arrays become lists, and an object that JSON has no type for becomes `str(object)`.
-    `status` is the HTTP status, `headers` are added to the response, and `media` is its media type.
+    NumPy arrays become lists. `status` is the HTTP status, `headers` are added to the response, and
+    `media` is its media type. Raises AttributeError for an object that JSON has no type for.
     """
-
-    def encoded(value: Any) -> Any:
-        return value.tolist() if isinstance(value, np.ndarray | np.generic) else str(value)
-
-    return Response(msgspec.json.encode(body, enc_hook=encoded), status, headers, media)
+    content = msgspec.json.encode(body, enc_hook=methodcaller("tolist"))
+    return Response(content, status, headers, media)
 
 
 def problem_response(
@@ -467,19 +425,15 @@ def problem_response(
 def _error_response(request: Request, error: Any) -> Response:
     """Return the response that `problem_response` makes for an exception of a request.
 
-    A Refusal and starlette's HTTPException have a status and headers of their own; for the statuses
-    404 and 405 of the latter, dengine has its own text. The status is 400 if the client
-    disconnected, and for other errors the one that `STATUSES` has for their type, with the error's
-    text, in which Python's arguments are written as options. Any other exception gets 500 with a
-    general text, and is logged with its traceback.
+    An HTTPException has a status, a text and headers of its own; but for the statuses 404 and 405,
+    which only starlette raises, dengine has its own text. For other errors the status is the one
+    that `STATUSES` has for their type, with the error's text, in which Python's arguments are
+    written as options. Any other exception gets 500 with a general text, and is logged with its
+    traceback.
     """
-    if isinstance(error, Refusal):
-        return problem_response(error.status, error.detail, error.headers)
     if isinstance(error, HTTPException):
-        detail = NO_ROUTE.get(error.status_code, str(error.detail))
+        detail = NO_ROUTE.get(error.status_code, error.detail)
         return problem_response(error.status_code, detail, error.headers)
-    if isinstance(error, ClientDisconnect):  # nobody reads it
-        return problem_response(400, "Expected the whole of the request.")
     for error_type, status in STATUSES.items():
         if isinstance(error, error_type):
             return problem_response(status, as_options(str(error)))
@@ -496,9 +450,10 @@ STATUSES: dict[type[Exception], int] = {  # the first that fits
     BusyError: 503,
     StoreError: 503,
     DengineError: 422,
+    ClientDisconnect: 400,  # nobody reads it
 }
 HANDLERS: Mapping[Any, Callable[[Request, Any], Response]] = dict.fromkeys(
-    (Refusal, HTTPException, ClientDisconnect, *STATUSES, Exception), _error_response
+    (HTTPException, *STATUSES, Exception), _error_response
 )
 
 # The OpenAPI document
@@ -512,7 +467,9 @@ class Operation:
     ----------
     method, path : str
     handler : callable
-        Called with the request's fields as keyword arguments. Its docstring is the summary.
+        Called with the request's fields as keyword arguments. Its docstring is the summary. It
+        returns the fields of the response as a dict, a record that has these fields, or a whole
+        response.
     response : str
         A name in `RESPONSES`, or a media type.
     optional_fields : dict
@@ -520,17 +477,14 @@ class Operation:
     raw_parameter : str
         Name of the parameter that gets the body if the body is bytes; the other parameters are then
         read from the query. "": the body must be JSON.
-    examples : tuple of dict
-        Examples of the body.
     """
 
     method: str
     path: str
-    handler: Callable[..., Awaitable[Json | Response]]
+    handler: Callable[..., Awaitable[object]]
     response: str
     optional_fields: Json = field(default_factory=dict)
     raw_parameter: str = ""
-    examples: tuple[Json, ...] = ()
 
     @cached_property
     def request_type(self) -> type[Struct]:
@@ -544,61 +498,74 @@ class Operation:
         the operation has a `raw_parameter` and the body is bytes (application/octet-stream), the
         body is the field of this name, and the other fields are read from the query. Optional
         fields that were left out are not passed on. If the handler returns no response, its result
-        is sent as JSON. Raises Refusal for a request that cannot be read, ClientDisconnect for one
-        that is cut off, and whatever the handler raises; the application turns all into responses.
+        is sent as JSON, a record with the fields of the response type. Raises HTTPException for a
+        request that cannot be read, ClientDisconnect for one that is cut off, and whatever the
+        handler raises; the application turns all into responses.
         """
+        media = media_type(request)
         if self.method == "GET":
             values = read_query(request, self.request_type)
-        elif self.raw_parameter and media_type(request) == RAW:
+        elif media == JSON:
+            values = await read_body(request, self.request_type)
+        elif media == RAW and self.raw_parameter:
             body = {self.raw_parameter: await request.body()}
             values = read_query(request, self.request_type, **body)
         else:
-            other_types = [RAW] if self.raw_parameter else []
-            values = await read_body(request, self.request_type, *other_types)
+            accepted = f"{JSON}, {RAW}" if self.raw_parameter else JSON
+            problem = f"Expected a body of {accepted}, got {shortened(media)}."
+            raise HTTPException(415, problem, {"Accept": accepted})
         given = msgspec.structs.asdict(values).items()
         result = await self.handler(**{key: value for key, value in given if value is not UNSET})
-        return result if isinstance(result, Response) else json_response(result)
+        if isinstance(result, Response):
+            return result
+        is_json = isinstance(result, dict)
+        return json_response(result if is_json else response_fields(self.response, result))
 
     def describe(self, schemas: Json) -> Json:
         """Return the operation as an OpenAPI operation object, a dict.
 
         It has the summary, the responses (200, and any other status as a problem), and for a POST
-        the request's body with its examples. The fields are parameters of a GET, and of a POST
-        whose body may be bytes; only those in the path are marked as required. `schemas` has the
-        JSON schema of every request type and response by name.
+        the request's body. The fields are parameters of a GET, and of a POST whose body may be
+        bytes; only those in the path are marked as required. `schemas` has the JSON schema of every
+        request type and response by name.
         """
         request_schema = schemas[self.request_type.__name__]
-        is_json = self.response in RESPONSES
-        schema = {"$ref": REF.format(name=self.response)} if is_json else {"type": "string"}
-        media = JSON if is_json else self.response
-        problem = {PROBLEM: {"schema": {"$ref": REF.format(name="Problem")}}}
-        responses = {
-            "200": {"description": "Done.", "content": {media: {"schema": schema}}},
-            "default": {"description": "A problem.", "content": problem},
-        }
-        parameters: list[Json] = []
+        if self.response in RESPONSES:
+            content = _json_content(self.response)
+        else:
+            content = {self.response: {"schema": {"type": "string"}}}
+        problem = _json_content("Problem", PROBLEM)
+        in_path = set(re.findall(r"{(\w+)", self.path))
+        parameters = [
+            {
+                "name": name,
+                "in": "path" if name in in_path else "query",
+                "required": name in in_path,
+                "schema": field_schema,
+            }
+            for name, field_schema in request_schema["properties"].items()
+            if name != self.raw_parameter
+        ]
         description: Json = {
             "summary": request_schema["description"],
-            "parameters": parameters,
-            "responses": responses,
+            "parameters": parameters if self.method == "GET" or self.raw_parameter else [],
+            "responses": {
+                "200": {"description": "Done.", "content": content},
+                "default": {"description": "A problem.", "content": problem},
+            },
         }
-        if self.method == "GET" or self.raw_parameter:
-            for name, field_schema in request_schema["properties"].items():
-                place = "path" if f"{{{name}" in self.path else "query"
-                if name != self.raw_parameter:
-                    required = place == "path"
-                    parameters.append(
-                        {"name": name, "in": place, "required": required, "schema": field_schema}
-                    )
         if self.method == "GET":
             return description
-        body: Json = {"schema": {"$ref": REF.format(name=self.request_type.__name__)}}
-        examples = {str(i): {"value": value} for i, value in enumerate(self.examples)}
-        content = {JSON: body | {"examples": examples}}
+        body = _json_content(self.request_type.__name__)
         if self.raw_parameter:
             text = "float32, little-endian."
-            content[RAW] = {"schema": {"type": "string", "format": "binary", "description": text}}
-        return description | {"requestBody": {"required": True, "content": content}}
+            body[RAW] = {"schema": {"type": "string", "format": "binary", "description": text}}
+        return description | {"requestBody": {"required": True, "content": body}}
+
+
+def _json_content(name: str, media: str = JSON) -> Json:
+    """Return an OpenAPI content object: JSON of the named schema, as the given media type."""
+    return {media: {"schema": {"$ref": REF.format(name=name)}}}
 
 
 def openapi_document(operations: Iterable[Operation], version: str) -> Json:

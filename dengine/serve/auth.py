@@ -10,20 +10,22 @@ import base64
 import hmac
 import os
 import re
+import ssl
 import stat
 from contextvars import ContextVar
 from dataclasses import dataclass, field
-from http import HTTPStatus
 from ipaddress import ip_address
 from itertools import compress
 from pathlib import Path
 from urllib.parse import urlsplit
 
 from starlette.datastructures import Headers
+from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from ..errors import SettingError, instead
-from .api import Refusal, problem_response
+from ..files import FilePath
+from .api import problem_response
 
 MIN_TOKEN_LENGTH = 16  # characters
 # A secret, a role and the owner's name.
@@ -78,7 +80,7 @@ def read_tokens(file: Path) -> tuple[Token, ...]:
     # From version 254 on, systemd gives a credential to the service's user by an ACL, which shows
     # as a permission of the group.
     credentials = os.environ.get("CREDENTIALS_DIRECTORY", "")
-    is_credential = bool(credentials) and file.absolute().parent == Path(credentials)
+    is_credential = file.absolute().parent == Path(credentials)
     has_owners = hasattr(os, "getuid")  # on Windows the mode does not say who may read
     if has_owners and mode & (0o037 if is_credential else 0o077):
         raise SettingError(
@@ -97,6 +99,36 @@ def read_tokens(file: Path) -> tuple[Token, ...]:
             f"one: (umask 077; openssl rand -hex 24 > {file})"
         )
     return tokens
+
+
+def check_key_pair(cert: FilePath | None, key: FilePath | None) -> None:
+    """Check a certificate and its key: load both once.
+
+    Parameters
+    ----------
+    cert, key : path or None
+        PEM files. None for both: there is nothing to check.
+
+    Raises
+    ------
+    SettingError
+        For only one of the two, for files that cannot be used, and for a key with a password.
+    """
+    if cert is None and key is None:
+        return
+    if cert is None or key is None:
+        raise SettingError(
+            "Expected a certificate and its key together (--cert and --key, or --opcua-cert and "
+            "--opcua-key), got one of them."
+        )
+    # OSError includes ssl.SSLError. Without a password OpenSSL would ask the terminal for one.
+    with instead(
+        SettingError,
+        f"Cannot use {cert} and {key} for TLS",
+        OSError,
+        do="use PEM files, and a key without a password",
+    ):
+        ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER).load_cert_chain(cert, key, password="none")
 
 
 def is_loopback(host: str) -> bool:
@@ -165,6 +197,7 @@ def take_token(scope: Scope, authorization: str) -> str:
         return ""
 
 
+CHALLENGES = 'Basic realm="dengine", charset="UTF-8"', 'Bearer realm="dengine"'
 CLOSE = {"Connection": "close"}  # bytes of the body that were not read are no next request
 TOO_LARGE = 413, f"Expected a request of at most {MAX_BODY} bytes, got a larger one.", CLOSE
 HEADERS = [  # of every response
@@ -201,27 +234,25 @@ class Guard:
         self.tokens = tokens
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Pass an allowed request on to the application, or answer it with the refusal.
+        """Pass an allowed HTTP request on to the application, or answer it with the refusal.
 
-        What is no HTTP request, like the application's start and end, passes unchecked. The size of
-        an allowed request's body is limited while the application reads it, by `_limit_body`.
+        The size of an allowed request's body is limited while the application reads it, by
+        `_limit_body`.
         """
-        if scope["type"] != "http":
-            await self.app(scope, receive, send)
-            return
         try:
             self._check(scope)
-        except Refusal as refusal:
-            response = problem_response(refusal.status, refusal.detail, CLOSE | refusal.headers)
-            if refusal.status == HTTPStatus.UNAUTHORIZED:
-                # A header of its own: Chromium reads only the first scheme of each.
-                response.headers.append("WWW-Authenticate", 'Bearer realm="dengine"')
+        except HTTPException as refusal:
+            response = problem_response(refusal.status_code, refusal.detail, CLOSE)
+            if refusal.status_code == 401:
+                # Each has a header of its own: Chromium reads only the first scheme of a header.
+                for challenge in CHALLENGES:
+                    response.headers.append("WWW-Authenticate", challenge)
             await response(scope, receive, _with_headers(send))
         else:
             await self.app(scope, _limit_body(receive), _with_headers(send))
 
     def _check(self, scope: Scope) -> None:
-        """Raise Refusal for a request that is not allowed.
+        """Raise HTTPException for a request that is not allowed.
 
         The checks are, in this order: a request to a server without tokens must call it localhost
         or by a loopback address (421); `_check_token` checks the token, and sets the context
@@ -234,8 +265,8 @@ class Guard:
         host = headers.get("host", "")
         # A web page on another name has no token: browsers send Basic credentials by origin.
         if not self.tokens and not names_this_machine(host):
-            raise Refusal(
-                HTTPStatus.MISDIRECTED_REQUEST,
+            raise HTTPException(
+                421,
                 "Expected the server to be called as localhost or 127.0.0.1, for it has no token.",
             )
         self._check_token(scope, headers)
@@ -244,54 +275,50 @@ class Guard:
         is_same_origin = origin is None or origin.partition("://")[2].lower() == host.lower()
         is_same_site = headers.get("sec-fetch-site", "none") in ("same-origin", "none")
         if scope["method"] not in SAFE_METHODS and not (is_same_origin and is_same_site):
-            raise Refusal(
-                HTTPStatus.FORBIDDEN,
+            raise HTTPException(
+                403,
                 "Expected a request of this server's own pages, got one of another site.",
             )
         if int(headers.get("content-length", 0)) > MAX_BODY:
-            raise Refusal(*TOO_LARGE)
+            raise HTTPException(*TOO_LARGE)
 
     def _check_token(self, scope: Scope, headers: Headers) -> None:
         """Check a request's token, and set the context variable `CURRENT_TOKEN` to it.
 
-        Raises Refusal: 401 for a missing or wrong token, 403 for a viewer's token on a request that
-        may change something (a method other than GET, HEAD and OPTIONS). A request for /healthz
-        without a right token is allowed, and `CURRENT_TOKEN` is then not set. A server without
-        tokens allows every request, with the token `ANYBODY`. A secret in the path is removed from
-        `scope`, the ASGI scope of the request.
+        Raises HTTPException: 401 for a missing or wrong token, 403 for a viewer's token on a
+        request that may change something (a method other than GET, HEAD and OPTIONS). A request for
+        /healthz without a right token is allowed, and `CURRENT_TOKEN` is then not set. A server
+        without tokens allows every request, with the token `ANYBODY`. A secret in the path is
+        removed from `scope`, the ASGI scope of the request.
         """
         secret = take_token(scope, headers.get("authorization", ""))
         token = find_token(self.tokens, secret) if self.tokens else ANYBODY
         if token is not None:
             CURRENT_TOKEN.set(token)
             if not token.operates and scope["method"] not in SAFE_METHODS:
-                raise Refusal(
-                    HTTPStatus.FORBIDDEN, "Expected an operator's token, got a viewer's token."
-                )
+                raise HTTPException(403, "Expected an operator's token, got a viewer's token.")
         elif scope["path"] != "/healthz":
-            challenge = {"WWW-Authenticate": 'Basic realm="dengine", charset="UTF-8"'}
-            raise Refusal(
-                HTTPStatus.UNAUTHORIZED,
+            raise HTTPException(
+                401,
                 "Expected the server's token: Authorization: Bearer TOKEN, or any user name with "
                 "it as the password.",
-                challenge,
             )
 
 
 def _limit_body(receive: Receive) -> Receive:
     """Return an ASGI `receive` that passes on the messages of the given one.
 
-    It raises Refusal 413 once the body of the request has more than `MAX_BODY` bytes.
+    It raises HTTPException 413 once the body of the request has more than `MAX_BODY` bytes.
     """
     bytes_left = MAX_BODY
 
     async def receive_body() -> Message:
-        """Return the next message, and count the body's bytes; raise Refusal 413 for too many."""
+        """Return the next message, and count its bytes; raise HTTPException 413 for too many."""
         nonlocal bytes_left
         message = await receive()
         bytes_left -= len(message.get("body", b""))
         if bytes_left < 0:
-            raise Refusal(*TOO_LARGE)
+            raise HTTPException(*TOO_LARGE)
         return message
 
     return receive_body

@@ -5,7 +5,6 @@ outcome.
 """
 
 import asyncio
-import uuid
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from typing import Any
@@ -13,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from ..cells.replay import ReplayCell
-from ..errors import BusyError, log
+from ..errors import log
 from ..records import Action, Outcome
 from .service import CellService
 
@@ -24,15 +23,12 @@ POLICY = {"alpha": 0.1, "lower_bound": 0.9, "audit_rate": 0.05}
 
 
 @asynccontextmanager
-async def playing(
-    service: CellService, data: Any = "insertion", speed: float = 1.0, seed: int = 0
-) -> AsyncIterator[None]:
+async def playing(service: CellService, data: Any, speed: float, seed: int) -> AsyncIterator[None]:
     """Play recordings through the service in a random order, in a task beside the context's block.
 
     The task plays each recording once, and is cancelled when the context ends. It reports the
-    results of verified parts and of line stops, leaves a part or its report out if the queue is
-    full, and waits for retrains during the first `N_FAST` parts. Its errors are logged (see
-    `drive`).
+    results of verified parts and of line stops, and waits for retrains during the first `N_FAST`
+    parts. Its errors are logged (see `drive`).
 
     Parameters
     ----------
@@ -66,29 +62,22 @@ async def drive(service: CellService, cell: ReplayCell, speed: float) -> None:
     `cell` plays the recording, from its first part on. The recorded result is reported for verified
     parts, and for accepted parts that are bad, which stop the line. The first `N_FAST` parts come
     without a pause, but a retrain that is under way is waited for; later parts come at `speed`
-    parts per second, and their report after 40 % of this time. If the queue is full, the part or
-    its report is left out, and the next part comes without a pause. An accepted good part and a
-    rejected part get no report. A log line says when all parts were played. Any other exception is
-    logged and ends the demonstration, not the server.
+    parts per second, and their report after 40 % of this time. An accepted good part and a rejected
+    part get no report. A log line says when all parts were played. An exception, also that of a
+    full queue, is logged and ends the demonstration, not the server.
     """
     loop = asyncio.get_running_loop()
-    run = uuid.uuid4().hex[:8]
     next_start = loop.time()
     try:
         for cycle in range(len(cell.order)):
             seconds = 0.0 if cycle < N_FAST else 1.0 / speed
             next_start = max(next_start + seconds, loop.time())
             trace = cell.insert()
-            request = f"{run}-{cycle + 1}"
-            try:
-                response = await service.decide(trace, request, f"{cycle + 1:04d}")
-                action = response.decision.action
-                await asyncio.sleep(seconds * CHECK_SHARE)
-                stopped = action is Action.ACCEPT and cell.proceed() is Outcome.STOPPED
-                if action is Action.VERIFY or stopped:
-                    await service.report(request, cell.verify())
-            except BusyError:  # a robot would verify the part, or report it again
-                continue
+            decision = (await service.decide(trace, part=f"{cycle + 1:04d}")).decision
+            await asyncio.sleep(seconds * CHECK_SHARE)
+            stopped = decision.action is Action.ACCEPT and cell.proceed() is Outcome.STOPPED
+            if decision.action is Action.VERIFY or stopped:
+                await service.report(decision.id, cell.verify())
             await asyncio.sleep(next_start - loop.time())
             while cycle < N_FAST and service.engine.state.is_retraining:
                 await asyncio.sleep(POLL_SECONDS)

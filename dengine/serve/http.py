@@ -8,8 +8,7 @@ app = create_app(CellService(lambda: DataEngine.open_or_create("cell.db"), "cell
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator, Callable, Sequence
-from contextlib import AbstractAsyncContextManager, AsyncExitStack, asynccontextmanager
+from collections.abc import AsyncIterator, Callable
 from dataclasses import replace
 from functools import cached_property
 from itertools import islice
@@ -18,7 +17,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 from msgspec import Meta
+from prometheus_client import CONTENT_TYPE_LATEST
 from starlette.applications import Starlette
+from starlette.exceptions import HTTPException
 from starlette.middleware import Middleware
 from starlette.requests import Request
 from starlette.responses import FileResponse, Response, StreamingResponse
@@ -29,19 +30,19 @@ from .. import __version__
 from ..decision.policy import Policy
 from ..engine.corrections import Changed
 from ..engine.engine import DataEngine
-from ..errors import expect
 from ..history.explain import explain, find_decision_id
-from ..history.map import part_map
-from ..history.status import NEWEST, iterate_decisions, read_course
+from ..history.map import PartMap, part_map
+from ..history.status import Course, iterate_decisions, read_course
 from ..records import Action, is_name
 from ..store.records import StoredDecision, unknown_decision
 from ..store.views import HistoryFilter
 from . import api
-from .api import Json, Operation, Refusal, field_types, response_fields
+from .api import Json, Operation, field_types, response_fields
 from .auth import CURRENT_TOKEN, Guard, Token
 from .metrics import Metrics
-from .service import CellService
-from .xmlrpc import routes as xmlrpc_routes
+from .robot_calls import RobotCalls
+from .service import CellService, ReportResponse, ServiceResponse
+from .xmlrpc import rpc_route
 
 if TYPE_CHECKING:
     from ..cells.ur.recorder import RtdeRecorder
@@ -55,8 +56,6 @@ N_LABELS = 200  # newest labels among which they are looked for
 STATIC = Path(__file__).parent / "page" / "static"
 # All are index.html, whose script shows the view of the URL.
 VIEWS = ("/", "/overview", "/map", "/part", "/history", "/actions")
-MIN_SHIFT_HOURS = 0.0003
-Beside = Callable[[CellService], AbstractAsyncContextManager[object]]
 
 # Types of requests' fields
 Id = Annotated[str, Meta(description="Of the decision.")]
@@ -75,8 +74,8 @@ Author = Annotated[
 ]
 Limit = Annotated[int, Meta(ge=1, le=200, description="How many at most.")]
 ShiftHours = Annotated[
-    float,
-    Meta(ge=0.0, le=1e7, description="Length of a shift, which is then a stretch; 0: no shifts."),
+    int,
+    Meta(ge=0, le=10**7, description="Length of a shift, which is then a stretch; 0: no shifts."),
 ]
 ShiftStart = Annotated[
     float, Meta(ge=0.0, le=1e7, description="When a shift begins, in hours since 1970.")
@@ -87,8 +86,8 @@ class HttpApi:
     """The handlers of all HTTP requests.
 
     A handler's parameters are the request's fields, and its docstring is its summary in the OpenAPI
-    document. It returns the fields of the response as JSON, or a whole response. What it raises
-    becomes a `Problem`, as `api.STATUSES` says.
+    document. What it may return is said by `Operation`. What it raises becomes a `Problem`, as
+    `api.STATUSES` says.
 
     Parameters
     ----------
@@ -101,30 +100,15 @@ class HttpApi:
 
     @cached_property
     def operations(self) -> list[Operation]:
-        """The `Operation` of every path and method: its handler, the type of its response, and
-        examples; cached.
+        """The `Operation` of every path and method: its handler, and the type of its response;
+        cached.
         """
-        one_channel: Json = {
-            "trace": [0.1, 1.5, 2.25, None, 0.4],
-            "request": "order-7",
-            "part": "P-1007",
-        }
-        two_channels: Json = {"trace": [[0.1, 1.5, 2.25], [0.0, 0.2, 0.1]]}
-        good: Json = {"id": "order-7", "success": True}
-        bad: Json = {"part": "P-1007", "success": False, "author": "Kim"}
         # A guarantee may name a class, and no request over the network may cause an import.
         policy = field_types(Policy, "guarantee") | {"force_limits": list[str]}
-        filter_ = field_types(HistoryFilter, "label")
+        filter_ = field_types(HistoryFilter)
         return [
-            Operation(
-                "POST",
-                "/decide",
-                self.decide,
-                "DecideResponse",
-                raw_parameter="trace",
-                examples=(one_channel, two_channels),
-            ),
-            Operation("POST", "/report", self.report, "ReportResponse", examples=(good, bad)),
+            Operation("POST", "/decide", self.decide, "DecideResponse", raw_parameter="trace"),
+            Operation("POST", "/report", self.report, "ReportResponse"),
             Operation("POST", "/correct", self.correct, "Changed"),
             Operation("POST", "/forget", self.forget, "Changed"),
             Operation("POST", "/rollback", self.rollback, "Changed"),
@@ -162,7 +146,7 @@ class HttpApi:
         ] = None,
         part: Annotated[str | int | None, Meta(description="The part's number.")] = None,
         channels: Annotated[int, Meta(ge=1, le=99_999, description="Of bytes.")] = 1,
-    ) -> Json:
+    ) -> ServiceResponse:
         """Decide on a trace. The same trace and request id get the same decision; another trace
         with that id gets 409; a trace that the engine does not take, such as one of a wrong shape,
         and an invalid id or part, get 422.
@@ -172,11 +156,7 @@ class HttpApi:
         the reason no_store. 503: the queue is full or the server is closing, and nothing was
         recorded; verify the part.
         """
-        samples = api.as_samples(trace, channels)
-        response = await self.service.decide(samples, request, part)
-        return response_fields(
-            "DecideResponse", response.decision, late=response.late, seconds=response.seconds
-        )
+        return await self.service.decide(api.as_samples(trace, channels), request, part)
 
     async def report(
         self,
@@ -190,7 +170,7 @@ class HttpApi:
         id_: Id = "",
         part: PartNumber = "",
         author: Author = "",
-    ) -> Json:
+    ) -> ReportResponse:
         """Report the outcome of a part. The label is on disk when the response comes.
 
         State either the decision's id or the part; both or neither is 422, and so are an invalid
@@ -206,20 +186,21 @@ class HttpApi:
         """
         checked = _checked_author(author) if author or CURRENT_TOKEN.get().name else ""
         decision_id = await self._find_id(id_, part)
-        response = await self.service.report(decision_id, success, checked)
-        return response_fields("ReportResponse", response)
+        return await self.service.report(decision_id, success, checked)
 
     async def _find_id(self, id_: str, part: str) -> str:
         """Return the id of a decision, given by its id or by its part's number.
 
-        Raises Refusal 422 for both or neither, UnknownDecisionError for a part without a decision,
-        and ReportConflictError for a part with several (rejects count only if there is nothing
-        else). A decision's id in place of the part's number is found, too. For a part it waits in
-        the queue, and raises BusyError if that is full or the service is closing, and StoreError.
-        An id is not looked up.
+        Raises HTTPException 422 for both or neither, UnknownDecisionError for a part without a
+        decision, and ReportConflictError for a part with several (rejects count only if there is
+        nothing else). A decision's id in place of the part's number is found, too. For a part it
+        waits in the queue, and raises BusyError if that is full or the service is closing, and
+        StoreError. An id is not looked up.
         """
         if bool(id_) == bool(part):
-            raise Refusal(422, "Expected the id of a decision, or the part's number in its place.")
+            raise HTTPException(
+                422, "Expected the id of a decision, or the part's number in its place."
+            )
         return id_ or await self.service.read(lambda store: find_decision_id(store, part))
 
     async def correct(
@@ -228,7 +209,7 @@ class HttpApi:
         id_: Id = "",
         part: PartNumber = "",
         author: Author = "",
-    ) -> Json:
+    ) -> Changed:
         """Correct a label, from the next decision on, record that as an event, and return what
         changed.
 
@@ -250,7 +231,7 @@ class HttpApi:
         ids: Annotated[list[str], Meta(description="Of the decisions.")],
         author: Author = "",
         reason: Annotated[str, Meta(description="For the event log.")] = "",
-    ) -> Json:
+    ) -> Changed:
         """Leave the labels of the decisions `ids` out of training and of all counts, record that as
         an event with the reason, and return what changed.
 
@@ -271,7 +252,7 @@ class HttpApi:
         self,
         version: Annotated[int, Meta(description="Its number, as /versions lists it.")],
         author: Author = "",
-    ) -> Json:
+    ) -> Changed:
         """Let an earlier version of the model decide again, as a new version, and pin it: no
         automatic retrain replaces it, until /release or /retrain, or until /forget of a label that
         it was trained with. A training under way is discarded. If it is pinned already, nothing
@@ -281,7 +262,7 @@ class HttpApi:
         """
         return await self._change(author, lambda engine, by: engine.rollback(version, by))
 
-    async def release(self, author: Author = "") -> Json:
+    async def release(self, author: Author = "") -> Changed:
         """Let retrains replace a version again that /rollback pinned; if none is pinned, nothing
         changes, but a training under way begins again. 422: no author (unless the token has a
         name), or an author that is not the token's; 503: the queue is full, or the store does not
@@ -289,7 +270,7 @@ class HttpApi:
         """
         return await self._change(author, lambda engine, by: engine.release(by))
 
-    async def policy(self, author: Author = "", **changes: Any) -> Json:
+    async def policy(self, author: Author = "", **changes: Any) -> Changed:
         """Change settings of the policy, from the next decision on; shadow verifies every part.
 
         Settings that are left out stay as they are. Many changes start the decision rule anew, so
@@ -302,7 +283,7 @@ class HttpApi:
             author, lambda engine, by: engine.set_policy(engine.policy.changed(**changes), by)
         )
 
-    async def retrain(self, author: Author = "") -> Json:
+    async def retrain(self, author: Author = "") -> Changed:
         """Begin a retrain, record who asked for it as an event, and do not wait for its end.
 
         A pinned version is released, so that the new version may replace it. If a retrain is under
@@ -319,54 +300,41 @@ class HttpApi:
 
             If a retrain is under way, or waits until it can begin, nothing is done.
             """
-            if engine.state.is_retraining:
-                return Changed(
-                    "retrain",
-                    "A retrain is under way already; nothing changed.",
-                    None,
-                    engine.version,
-                )
-            engine.release(by)
-            event = engine.store.events.put("retrain", "asked for by hand", author=by)
-            engine.retrain(wait=False)
-            return Changed("retrain", "The retrain has begun.", event, engine.version)
+            event = None
+            text = "A retrain is under way already; nothing changed."
+            if not engine.state.is_retraining:
+                engine.release(by)
+                event = engine.store.events.put("retrain", "asked for by hand", author=by)
+                engine.retrain(wait=False)
+                text = "The retrain has begun."
+            return Changed("retrain", text, event, engine.version)
 
         return await self._change(author, begin)
 
     async def status(
         self,
-        last: Annotated[
-            int,
-            Meta(ge=1, le=100_000, description="Number of newest decisions counted as `newest`."),
-        ] = NEWEST,
         watch: Annotated[
             bool, Meta(description="Include the state of the safe mode's detectors.")
         ] = False,
     ) -> Json:
         """Return how the cell is doing: counts of decisions, version, faults, queue and alarm.
 
-        The counts are of all decisions, and of the newest `last`. 503: the queue is full, or the
-        store cannot be read.
+        The counts are of all decisions, and of the newest 500. 503: the queue is full, or the store
+        cannot be read.
         """
-        status = await self.service.status(last, watch)
+        status = await self.service.status(watch)
         line = {name: getattr(self.service, name) for name in api.LINE}
         texts = {"alarm": status.alarm, "claim": status.certificate.sentence}
         return response_fields("Status", status, **texts, **line)
 
-    async def decision(
-        self,
-        id_: Id,
-        trace: Annotated[bool, Meta(description="Include its samples.")] = False,
-    ) -> Json:
+    async def decision(self, id_: Id) -> StoredDecision:
         """Return one decision with its label; 404 for an unknown id, 422 for an invalid one, 503 if
         the queue is full or the id cannot be looked up.
         """
-        stored = await self._find(id_)
-        return response_fields("Decision", stored, trace=stored.trace if trace else None)
+        return await self._find(id_)
 
     async def decisions(
         self,
-        label: Literal["good", "bad", "none"] | None = None,
         open_: Annotated[
             bool, Meta(description="Only verified parts whose result was not reported.")
         ] = False,
@@ -377,8 +345,8 @@ class HttpApi:
         ] = "",
         **where: Any,
     ) -> Json:
-        """Return up to `limit` decisions without their traces, newest first, and in `older` the id
-        that `before` takes for the next page, null if none are left. An unknown `before` is 404.
+        """Return up to `limit` decisions, newest first, and in `older` the id that `before` takes
+        for the next page, null if none are left. An unknown `before` is 404.
 
         Only decisions with the given label, action, reason, predicted (what the model alone would
         have done) and part (the part's number) are returned, if these are given, and only those
@@ -386,14 +354,23 @@ class HttpApi:
         open, label and action are ignored. 422: a value that a field cannot have, or an invalid
         `before`; 503: the queue is full, or the store cannot be read.
         """
-        selection = HistoryFilter(label=label, **where)
-        before_id = (await self._find(before)).decision.id if before else None
-        stored = await self.service.read(
-            lambda store: _read_newest(store, selection, limit + 1, before_id, open_)
-        )
+        selection = HistoryFilter(**where)
+        if open_:
+            selection = replace(selection, action=Action.VERIFY, label="none")
+
+        def read_newest(store: SqlStore) -> list[StoredDecision]:
+            """Return the newest decisions that were asked for, and one more if there are more."""
+            decisions = iterate_decisions(store, selection, limit + 1, before or None)
+            if open_:  # a forgotten label was reported
+                decisions = (stored for stored in decisions if stored.source is None)
+            return list(islice(decisions, limit + 1))
+
+        if before:
+            await self._find(before)
+        stored = await self.service.read(read_newest)
         page = stored[:limit]
         return {
-            "decisions": [response_fields("Decision", item, trace=None) for item in page],
+            "decisions": [response_fields("Decision", item) for item in page],
             "older": page[-1].decision.id if len(stored) > limit else None,
         }
 
@@ -407,26 +384,19 @@ class HttpApi:
         """
         return await self.service.read(lambda store: _read_explanation(store, id_))
 
-    async def course(self, hours: ShiftHours = 0.0, start: ShiftStart = 0.0) -> Json:
+    async def course(self, hours: ShiftHours = 0, start: ShiftStart = 0.0) -> Course:
         """Return counts of the decisions in stretches, oldest first, with retrains.
 
         A stretch is a number of decisions that are counted together. With `hours` a stretch is a
         shift of this length, and `start` is when one of the shifts begins. Without it all decisions
         are split into at most 120 stretches of at least 20 decisions; the newest stretch may have
         fewer. At most the newest 120 stretches with decisions are returned, but all retrains of the
-        cell. 422: `hours` is not 0 and below 0.0003, about a second; 503: the
-        queue is full, or the store cannot be read.
+        cell. 503: the queue is full, or the store cannot be read.
         """
-        expect(
-            hours == 0.0 or hours >= MIN_SHIFT_HOURS,
-            f"hours of 0, or of {MIN_SHIFT_HOURS} or more, a second",
-            hours,
-        )
         by = {"seconds": 3600.0 * hours, "start": 3600.0 * start}
-        course = await self.service.read(lambda store: read_course(store, **by))
-        return response_fields("Course", course)
+        return await self.service.read(lambda store: read_course(store, **by))
 
-    async def embedding(self) -> Json:
+    async def embedding(self) -> PartMap:
         """Return where parts lie in the model's embedding, in two dimensions.
 
         The parts are the newest 250 references with a label of this cell and, of its newest 10
@@ -435,10 +405,7 @@ class HttpApi:
         503: the queue is full, or the store cannot be read.
         """
         engine = self.service.engine
-        parts = await self.service.read(
-            lambda store: part_map(store, engine.recipe, engine.version)
-        )
-        return response_fields("PartMap", parts)
+        return await self.service.read(lambda store: part_map(store, engine.recipe, engine.version))
 
     async def versions(self) -> Json:
         """Return every retrain of the cell or its product, dropped ones included, oldest first; a
@@ -470,14 +437,13 @@ class HttpApi:
 
         return StreamingResponse(event_stream(), media_type="text/event-stream")
 
-    async def me(self) -> Json:
+    async def me(self) -> Token:
         """Return the name and the rights of the request's token."""
-        return response_fields("Me", CURRENT_TOKEN.get())
+        return CURRENT_TOKEN.get()
 
     async def metrics(self) -> Response:
         """Return the metrics for Prometheus."""
-        body, media = self._metrics.text()
-        return Response(body, media_type=media)
+        return Response(self._metrics.text(), media_type=CONTENT_TYPE_LATEST)
 
     async def healthz(self) -> Response:
         """Return whether the engine answers: ok or degraded (200), down (503). It needs no token.
@@ -490,7 +456,7 @@ class HttpApi:
         running = self.service.engine.state
         is_alive = self.service.silent_seconds < MAX_SILENT
         faults = (running.store_fault, running.retrain_fault)
-        state = "degraded" if any(faults) else "ok"
+        state: Literal["ok", "degraded", "down"] = "degraded" if any(faults) else "ok"
         if not is_alive:
             state = "down"
         health = api.Health(state, *faults, self.service.waiting)
@@ -515,51 +481,34 @@ class HttpApi:
             raise unknown_decision(id_)
         return stored
 
-    async def _change(self, author: str, work: Callable[[DataEngine, str], Changed]) -> Json:
+    async def _change(self, author: str, work: Callable[[DataEngine, str], Changed]) -> Changed:
         """Call `work` in the engine's thread with the engine and the author, and return its
         `Changed`.
 
-        The result is in the form of the response. Raises Refusal for an author that
-        `_checked_author` does not take, BusyError if the queue is full or the service is closing,
-        and what `work` raises.
+        Raises HTTPException for an author that `_checked_author` does not take, BusyError if the
+        queue is full or the service is closing, and what `work` raises.
         """
         by = _checked_author(author)
-        changed = await self.service.call(lambda engine: work(engine, by))
-        return response_fields("Changed", changed)
+        return await self.service.call(lambda engine: work(engine, by))
 
 
 def _checked_author(author: str) -> str:
     """Return the author for the event log: the name of the token that the present request has
     (`CURRENT_TOKEN`), or the given name if this token has none.
 
-    In the given name each run of white space becomes a single space. Raises Refusal 422 if there is
-    no name, if the name is longer than 200 characters or not printable, and if both names are given
-    and differ.
+    In the given name each run of white space becomes a single space. Raises HTTPException 422 if
+    there is no name, if the name is longer than 200 characters or not printable, and if both names
+    are given and differ.
     """
     owner = CURRENT_TOKEN.get().name
     name = " ".join(author.split())
     if owner and name not in ("", owner):
-        raise Refusal(422, f"Expected author to be {owner}, whose token it is, or to be left out.")
+        raise HTTPException(
+            422, f"Expected author to be {owner}, whose token it is, or to be left out."
+        )
     if not is_name(owner or name):
-        raise Refusal(422, "Expected author, the name of who asks for it, for the event log.")
+        raise HTTPException(422, "Expected author, the name of who asks for it, for the event log.")
     return owner or name
-
-
-def _read_newest(
-    store: SqlStore, where: HistoryFilter, limit: int, before: str | None, unlabelled: bool
-) -> list[StoredDecision]:
-    """Return up to `limit` decisions that `where` selects, newest first, without their traces.
-
-    With `before` only decisions older than the one with this id are returned; none if the id is
-    unknown. With `unlabelled` only verified decisions whose label was never reported are returned,
-    and the action and label in `where` are ignored. A forgotten label counts as reported.
-    """
-    if unlabelled:
-        where = replace(where, action=Action.VERIFY, label="none")
-    decisions = iterate_decisions(store, where, limit, before)
-    if unlabelled:
-        decisions = (stored for stored in decisions if stored.source is None)
-    return list(islice(decisions, limit))
 
 
 def _read_explanation(store: SqlStore, id_: str) -> Json:
@@ -593,7 +542,6 @@ def create_app(
     service: CellService,
     tokens: tuple[Token, ...] = (),
     *,
-    beside: Sequence[Beside] = (),
     recorder: RtdeRecorder | None = None,
 ) -> Starlette:
     """Create the application. The caller closes the service after it has ended.
@@ -606,10 +554,6 @@ def create_app(
     tokens : tuple of Token, optional
         Empty: no request needs a token. Serve the application at a loopback address alone then;
         this is not checked here.
-    beside : sequence of callable
-        Each is called with the service and returns an async context, which lasts as long as the
-        application, in the same event loop: an OPC UA server, for example. One that fails to start
-        ends the application; its error is `app.state.failure`.
     recorder : RtdeRecorder, optional
         Records the traces for `decide_recorded`; the caller closes it.
 
@@ -618,33 +562,16 @@ def create_app(
     Starlette
     """
     routes: list[BaseRoute] = [
-        Route(operation.path, operation.serve, methods=[operation.method])
-        for operation in HttpApi(service).operations
+        *(
+            Route(operation.path, operation.serve, methods=[operation.method])
+            for operation in HttpApi(service).operations
+        ),
+        rpc_route(RobotCalls(service, recorder)),
+        *(Route(path, _index_page) for path in VIEWS),
+        Mount("/page/static", StaticFiles(directory=STATIC)),
     ]
-    routes += xmlrpc_routes(service, recorder)
-    routes += [Route(path, _index_page) for path in VIEWS]
-    routes.append(Mount("/page/static", StaticFiles(directory=STATIC)))
-
-    @asynccontextmanager
-    async def lifespan(app: Starlette) -> AsyncIterator[None]:
-        """Enter what `beside` returns, and leave it when the application ends.
-
-        If a start fails, what was entered is left, and the error is kept in `app.state.failure` and
-        raised.
-        """
-        async with AsyncExitStack() as stack:
-            try:
-                for start in beside:
-                    await stack.enter_async_context(start(service))
-            except Exception as error:
-                app.state.failure = error  # uvicorn says only that it did not start
-                raise
-            yield
-
     guard = Middleware(Guard, tokens=tokens)
-    app = Starlette(
-        routes=routes, middleware=[guard], exception_handlers=api.HANDLERS, lifespan=lifespan
-    )
+    app = Starlette(routes=routes, middleware=[guard], exception_handlers=api.HANDLERS)
     # A robot does not follow redirects, whose target a request's Host would determine.
     app.router.redirect_slashes = False
     return app

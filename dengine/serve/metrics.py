@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 from prometheus_client import CollectorRegistry, Histogram
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
-from prometheus_client.exposition import CONTENT_TYPE_LATEST, generate_latest
+from prometheus_client.exposition import generate_latest
 
 from ..records import RetrainReport
 from .service import CellService, ReportResponse, ServiceResponse
@@ -87,9 +87,9 @@ class Metrics:
         labels = [str(getattr(record, name)).lower() for name in HISTOGRAMS[kind].labels]
         self._histograms[kind].labels(*labels).observe(response.seconds)
 
-    def text(self) -> tuple[bytes, str]:
-        """Return all metrics in Prometheus's text format, and the content type."""
-        return generate_latest(self._registry), CONTENT_TYPE_LATEST
+    def text(self) -> bytes:
+        """Return all metrics in Prometheus's text format."""
+        return generate_latest(self._registry)
 
     def collect(self) -> Iterator[Metric]:
         """Yield gauges and counters with the present state of the engine and its queue.

@@ -11,12 +11,9 @@ most twice a second. The begin and the end of an alarm are events of the Server 
 """
 
 import asyncio
-import hmac
 import logging
-import os
-from collections.abc import AsyncIterator, Awaitable, Callable, Collection, Mapping
-from contextlib import asynccontextmanager, suppress
-from functools import wraps
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
+from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
 
@@ -31,18 +28,15 @@ from asyncua.server.user_managers import UserManager
 from asyncua.ua import VariantType
 from asyncua.ua.status_codes import StatusCodes
 
-from ..errors import DengineError, SettingError, TraceError, as_options, instead, log
-from ..files import FilePath
-from .auth import host_in_url, is_loopback
+from ..errors import DengineError, SettingError, TraceError, as_options, log
+from .auth import Token, check_key_pair, find_token, host_in_url, is_loopback
 from .robot_calls import RobotCalls, one_line
 from .service import CellService
 
-PORT = 4840
 MAX_MESSAGE = 1 << 20  # bytes, 250,000 samples
 CHUNK = 65535  # bytes of a part of a message
 MAX_CONNECTIONS = 50
 MAX_SUBSCRIPTIONS = 100
-MAX_CHANNELS = 1000
 USER = "dengine"
 NAMESPACE = "urn:dengine:cell"
 MIN_REFRESH = 0.5  # seconds between two readings of the store
@@ -71,17 +65,19 @@ STATUS_NAMES = {
 class TokenUsers(UserManager):
     """Who may read and call: the user `dengine` with a token as the password. Nobody administers.
 
+    A viewer's token is no password: whoever may read over OPC UA may also call.
+
     Parameters
     ----------
-    tokens : collection of str or None
-        None: everybody.
+    tokens : tuple of Token
+        Empty: everybody.
     encrypted : bool
         Whether clients without a certificate are refused; every client that encrypts has one.
         asyncua lets anyone open a channel without security, to ask for the endpoints, and would
         accept a session on it.
     """
 
-    def __init__(self, tokens: Collection[str] | None, encrypted: bool = False) -> None:
+    def __init__(self, tokens: tuple[Token, ...], encrypted: bool) -> None:
         self._tokens = tokens
         self._encrypted = encrypted
 
@@ -94,50 +90,29 @@ class TokenUsers(UserManager):
     ) -> User | None:
         """Return the user of a new session, who may read and call; or None to refuse the session.
 
-        The password is the token. A session is refused if the server encrypts and the client has no
-        certificate, or if the server has tokens and the user name or the token is wrong. `iserver`
-        is not used, and the content of the certificate is not checked.
+        The password is the token, a text. A session is refused if the server encrypts and the
+        client has no certificate, or if the server has tokens and the user name or the token is
+        wrong, or the token is a viewer's. `iserver` is not used, and the content of the certificate
+        is not checked.
         """
         if self._encrypted and not certificate:
             return None
-        if self._tokens is None:
+        if not self._tokens:
             return User(role=UserRole.User, name="anyone")
-        if isinstance(password, bytes):
-            secret = password
-        else:
-            secret = str(password or "").encode("utf-8", "surrogateescape")
-        # All are compared, so that the time does not show which one matches.
-        matches = sum(hmac.compare_digest(secret, token.encode()) for token in self._tokens)
-        if matches and username == USER:
+        token = find_token(self._tokens, password or "")
+        if token is not None and token.operates and username == USER:
             return User(role=UserRole.User, name=USER)
         return None
-
-
-async def _load_identity(server: Server, cert: FilePath, key: FilePath) -> None:
-    """Load the server's certificate and key, both in PEM.
-
-    Raises SettingError if a file cannot be read, holds no such thing, or needs a password.
-    """
-    with instead(
-        SettingError,
-        f"Cannot use {cert} and {key} for OPC UA",
-        OSError,
-        ValueError,
-        TypeError,
-        do="use PEM files, and a key without a password",
-    ):
-        await server.load_certificate(os.fspath(cert), "pem")
-        await server.load_private_key(os.fspath(key), format="pem")
 
 
 @asynccontextmanager
 async def opcua_server(
     service: CellService,
-    port: int = PORT,
+    port: int,
     host: str = "127.0.0.1",
-    tokens: Collection[str] | None = None,
-    cert: FilePath | None = None,
-    key: FilePath | None = None,
+    tokens: tuple[Token, ...] = (),
+    cert: Path | None = None,
+    key: Path | None = None,
 ) -> AsyncIterator[Server]:
     """Serve a cell over OPC UA in this event loop, as long as the context lasts.
 
@@ -149,8 +124,8 @@ async def opcua_server(
     port : int
         0: any free port; `server.bserver.port` of the yielded server then says which.
     host : str
-    tokens : collection of str, optional
-        Passwords of the user `dengine`; None: everybody may read and call.
+    tokens : tuple of Token, optional
+        Those of operators are passwords of the user `dengine`. Empty: everybody may read and call.
     cert, key : path, optional
         Files in PEM. With them the server speaks only Basic256Sha256, signed and encrypted; without
         them it encrypts nothing.
@@ -163,41 +138,38 @@ async def opcua_server(
     Raises
     ------
     SettingError
-        For an address that other machines can reach, unless there are tokens, a certificate and a
-        key; for a certificate without its key, or a key alone; for a file that cannot be read, or
-        that holds no certificate, or no key without a password.
+        For an address that other machines can reach, unless there are an operator's token, a
+        certificate and a key; and for a certificate and a key that `check_key_pair` refuses.
     OSError
         For a port in use.
     """
-    if (cert is None) != (key is None):
-        raise SettingError("Expected a certificate and its key together, got one of them.")
-    is_secure = cert is not None
-    if not (is_loopback(host) or (is_secure and tokens)):
+    has_password = any(token.operates for token in tokens)
+    if not (is_loopback(host) or (cert is not None and has_password)):
         raise SettingError(
             f"Expected a token, a certificate and a key to serve OPC UA on {host}; or stay on "
             "127.0.0.1."
         )
+    check_key_pair(cert, key)
     # asyncua logs tracebacks of whatever strangers send.
     logging.getLogger("asyncua").setLevel(logging.CRITICAL)
-    server = Server(user_manager=TokenUsers(tokens, is_secure))
+    server = Server(user_manager=TokenUsers(tokens, cert is not None))
     server.limits.max_message_size = MAX_MESSAGE
     server.limits.max_chunk_count = MAX_MESSAGE // CHUNK + 1
     server.iserver.max_connections = MAX_CONNECTIONS
     server.iserver.max_subscriptions = MAX_SUBSCRIPTIONS
-    identity = ua.AnonymousIdentityToken if tokens is None else ua.UserNameIdentityToken
+    identity = ua.UserNameIdentityToken if tokens else ua.AnonymousIdentityToken
     server.set_identity_tokens([identity])
     await server.init()
     server.allow_remote_admin(False)
     server.set_endpoint(f"opc.tcp://{host_in_url(host)}:{port}/dengine")
     server.set_server_name("dengine")
     await server.set_application_uri("urn:dengine:server")
-    if is_secure:
-        policy = ua.SecurityPolicyType.Basic256Sha256_SignAndEncrypt
-    else:
-        policy = ua.SecurityPolicyType.NoSecurity
-    server.set_security_policy([policy])
+    policy = ua.SecurityPolicyType.NoSecurity
     if cert is not None and key is not None:
-        await _load_identity(server, cert, key)
+        policy = ua.SecurityPolicyType.Basic256Sha256_SignAndEncrypt
+        await server.load_certificate(cert, "pem")
+        await server.load_private_key(key, format="pem")
+    server.set_security_policy([policy])
     space = AddressSpace(server, service)
     await space.build()
     async with server:
@@ -207,8 +179,7 @@ async def opcua_server(
             yield server
         finally:
             following.cancel()
-            with suppress(asyncio.CancelledError):
-                await following
+            await asyncio.wait([following])
 
 
 class AddressSpace:
@@ -225,8 +196,6 @@ class AddressSpace:
         self._server = server
         self._service = service
         self._calls = RobotCalls(service)
-        self._nodes: dict[str, Node] = {}
-        self._types: dict[str, VariantType] = {}
         self._alarm = ""
 
     async def build(self) -> None:
@@ -236,26 +205,23 @@ class AddressSpace:
         that sends alarm events. Call it once, before the server starts.
         """
         await self._server.import_xml(str(Path(__file__).with_name("cell.xml")))
-        index = await self._server.get_namespace_index(NAMESPACE)
-
-        def node_of(name: str) -> Node:
-            return self._server.get_node(ua.NodeId(ua.String(name), ua.Int16(index)))
-
-        for name in (*STATUS_NAMES, "LastRefused"):
-            self._nodes[name] = node_of(f"Cell.{name}")
-        for name in STATUS_NAMES:
-            self._types[name] = await self._nodes[name].read_data_type_as_variant_type()
-        await self._nodes["LastRefused"].write_value("")  # the file's empty text is read as null
+        self._namespace = await self._server.get_namespace_index(NAMESPACE)
+        await self._node("LastRefused").write_value("")  # the file's empty text is read as null
         for name, call in (("Decide", self.decide), ("Report", self.report)):
-            node = node_of(f"Cell.{name}")
+            node = self._node(name)
             arguments, results = [
                 await (await node.get_child(f"0:{kind}Arguments")).read_value()
                 for kind in ("Input", "Output")
             ]
             self._server.link_method(node, self._as_method(call, arguments, results))
         self._events: EventGenerator = await self._server.get_event_generator()
-        self._events.event.SourceNode = node_of("Cell").nodeid
+        cell = self._server.get_node(f"ns={self._namespace};s=Cell")
+        self._events.event.SourceNode = cell.nodeid
         self._events.event.SourceName = "Cell"
+
+    def _node(self, name: str) -> Node:
+        """Return the node of a variable or a method of the cell."""
+        return self._server.get_node(f"ns={self._namespace};s=Cell.{name}")
 
     async def decide(self, trace: list[float], channels: int, request: str, part: str) -> list[Any]:
         """Decide on a flat trace: all samples of the first channel, then those of the next.
@@ -267,12 +233,11 @@ class AddressSpace:
 
         If the queue is full, or the service or its engine is closed, the result is VERIFY with an
         empty id, the reason "busy", the bounds 0 and 1, and version 0. Raises TraceError if the
-        trace is empty, if its length is not a multiple of `channels`, if `channels` is not from 1
-        to `MAX_CHANNELS`, for a trace or part that the engine does not take, and for an id of
-        another trace. Raises ReportError for an invalid id, and SettingError for a first trace that
-        the settings do not allow.
+        trace is empty, if its length is not a multiple of `channels`, for a trace or part that the
+        engine does not take, and for an id of another trace. Raises ReportError for an invalid id,
+        and SettingError for a first trace that the settings do not allow.
         """
-        if not 1 <= channels <= MAX_CHANNELS or len(trace) % channels or not trace:
+        if channels < 1 or len(trace) % channels or not trace:
             raise TraceError(
                 f"Expected as many samples of each channel, got {len(trace)} of {channels} "
                 "channels."
@@ -316,7 +281,7 @@ class AddressSpace:
             log.warning("the OPC UA variables could not be brought up to date: %s", error)
             status = _status_code(StatusCodes.UncertainLastUsableValue)
             for name in STATUS_NAMES:
-                node = self._nodes[name]
+                node = self._node(name)
                 old = await node.read_data_value(raise_on_bad_status=False)
                 await node.write_value(ua.DataValue(old.Value, status))
 
@@ -328,11 +293,10 @@ class AddressSpace:
         ended.
         """
         for name, key in STATUS_NAMES.items():
-            value = status[key]
-            if self._types[name] is VariantType.Boolean:
-                value = bool(value)
-            data = ua.DataValue(ua.Variant(value, self._types[name]))
-            await self._nodes[name].write_value(data)
+            node = self._node(name)
+            type_ = await node.read_data_type_as_variant_type()
+            value = bool(status[key]) if type_ is VariantType.Boolean else status[key]
+            await node.write_value(value, type_)
         alarm = status["alarm"]
         if alarm != self._alarm:
             self._events.event.Severity = ALARM if alarm else ALARM_ENDED
@@ -354,11 +318,10 @@ class AddressSpace:
         logged.
         """
         forms = [_form(_type_of(item), item.ValueRank > 0) for item in arguments]
-        listed = ", ".join(
-            f"{item.Name} ({form})" for item, form in zip(arguments, forms, strict=True)
-        )
+        names = [item.Name for item in arguments]
+        expected = ", ".join(map("{} ({})".format, names, forms))
+        types = [_type_of(item) for item in results]
 
-        @wraps(call)
         async def method(parent: ua.NodeId, *variants: ua.Variant) -> Any:
             """Check the arguments, call, and return the results; for an error write its text into
             LastRefused, and return a bad status code.
@@ -367,22 +330,18 @@ class AddressSpace:
             texts = [ua.Variant("") if item.Value is None else item for item in variants]
             given = [_form(item.VariantType, isinstance(item.Value, list)) for item in texts]
             code = StatusCodes.BadInvalidArgument
-            line = f"Expected {listed}, got {', '.join(given) or 'none'}."
+            line = f"Expected {expected}, got {', '.join(given) or 'none'}."
             if given == forms:
                 try:
                     values = await call(*(item.Value for item in texts))
-                    return [
-                        ua.Variant(value, _type_of(result))
-                        for value, result in zip(values, results, strict=True)
-                    ]
+                    return list(map(ua.Variant, values, types))
                 except DengineError as error:
                     line = as_options(str(error))
                 except Exception:
                     log.exception("a call over OPC UA failed")
                     code = StatusCodes.BadInternalError
                     line = "The server failed on this call."
-            text = ua.Variant(one_line(line), VariantType.String)
-            await self._nodes["LastRefused"].write_value(ua.DataValue(text))
+            await self._node("LastRefused").write_value(one_line(line), VariantType.String)
             return _status_code(code)
 
         return method

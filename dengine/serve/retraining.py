@@ -2,8 +2,8 @@
 of `dengine serve` retrains.
 
 In a process of its own a retrain never holds the lock of the interpreter that answers decisions.
-Calls and results are pickled in the executor's thread, and their arrays are passed through a file
-in memory (`memfd_create`), which is written and read without that lock. `torch.multiprocessing`
+Calls and results are pickled in the executor's thread into a file in memory (`memfd_create`), and
+their arrays are written and read without that lock. `torch.multiprocessing`
 would pass each tensor through shared memory of its own, which holds the lock for tens of
 milliseconds.
 """
@@ -22,8 +22,6 @@ from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from multiprocessing.connection import wait
 from pathlib import Path
 from typing import Any, TypeVar
-
-import numpy as np
 
 # Signals that ask a process to end; SIGBREAK is Ctrl-Break on Windows.
 END_SIGNALS = [
@@ -75,10 +73,10 @@ class RetrainingProcess(Executor):
     def submit(self, fn: Callable[..., T], /, *args: Any, **kwargs: Any) -> Future[T]:
         """Queue a call of a picklable function, which runs in the process after earlier calls.
 
-        Returns the future of its result. If the result has arrays, wait for it before you submit
-        the next call: the end of the next call closes the file that holds these arrays. An
-        exception of the call, or an argument or result that cannot be pickled, is the future's.
-        Raises BrokenExecutor if the process has ended, and RuntimeError after `shutdown`.
+        Returns the future of its result. Wait for it before you submit the next call: the end of
+        the next call closes the file that holds the result. An exception of the call, or an
+        argument or result that cannot be pickled, is the future's. Raises BrokenExecutor if the
+        process has ended, and RuntimeError after `shutdown`.
         """
         call = _SharedPickle((fn, args, kwargs))
         return self._pool.submit(_call, call)  # type: ignore[arg-type]  # arrives as the tuple
@@ -94,43 +92,34 @@ class RetrainingProcess(Executor):
 
 
 class _SharedPickle:
-    """Pickles a value, with the data of its arrays, if any, in a file in memory (`memfd_create`).
+    """Pickles a value into a file in memory, if the system has `memfd_create`.
 
-    Unpickling this object gives the value; its arrays are copies. The file exists as long as this
-    object, so keep the object until the other process has unpickled it.
+    Unpickling this object gives the value. The file exists as long as this object, so keep the
+    object until the other process has unpickled it.
     """
 
     def __init__(self, value: Any) -> None:
         self._value = value
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Return what unpickles the value; write its arrays to a new file, which is closed with
-        this object.
-        """
-        arrays: list[pickle.PickleBuffer] = []
-        take_out = arrays.append if hasattr(os, "memfd_create") else None
-        pickled = pickle.dumps(self._value, 5, buffer_callback=take_out)
-        if not arrays:
-            return pickle.loads, (pickled,)
+        """Return what unpickles the value, from a new file, which is closed with this object."""
+        if not hasattr(os, "memfd_create"):
+            return pickle.loads, (pickle.dumps(self._value),)
         descriptor = os.memfd_create("dengine")
         weakref.finalize(self, os.close, descriptor)
+        # Of an array, pickle's protocol 5 writes and reads the memory itself, with no lock held.
         with open(descriptor, "wb", closefd=False) as file:
-            sizes = [file.write(array.raw()) for array in arrays]
-        return _unpickle, (pickled, f"/proc/{os.getpid()}/fd/{descriptor}", sizes)
+            pickle.dump(self._value, file, protocol=5)
+        return _unpickle, (f"/proc/{os.getpid()}/fd/{descriptor}",)
 
 
-def _unpickle(pickled: bytes, path: str, sizes: list[int]) -> Any:
-    """Return the value that a `_SharedPickle` holds; this unpickles it in the other process.
+def _unpickle(path: str) -> Any:
+    """Return the value that a `_SharedPickle` of the other process wrote to the file at `path`.
 
-    `pickled` is the pickle of the value without its arrays. The arrays are read from the file at
-    `path`, one after another; `sizes` are their sizes in bytes. Raises EOFError if the file is
-    shorter, and OSError if it is gone, because the object or its process has ended.
+    Raises OSError if the file is gone, because the object or its process has ended.
     """
-    arrays = [np.empty(size, np.uint8) for size in sizes]
     with Path(path).open("rb") as file:
-        if [file.readinto(array.data) for array in arrays] != sizes:
-            raise EOFError("Expected all arrays of a retrain, got fewer bytes.")
-    return pickle.loads(pickled, buffers=arrays)
+        return pickle.load(file)
 
 
 _NEWEST_RESULT: list[_SharedPickle] = []  # of the last call, until the next one ends

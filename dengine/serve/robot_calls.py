@@ -18,7 +18,6 @@ from __future__ import annotations
 import asyncio
 import uuid
 from collections import OrderedDict
-from collections.abc import Awaitable, Callable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -35,7 +34,7 @@ from ..errors import (
     log,
     shortened,
 )
-from ..records import ACTIONS, Action, Decision, TraceArray, as_id
+from ..records import ACTIONS, Decision, TraceArray, as_id
 from .api import as_samples
 from .service import CellService
 
@@ -48,7 +47,7 @@ MAX_SAMPLES = 200_000  # of all pieces of a part
 BUSY = "busy"  # reasons beside `Reason`, if nothing was recorded
 NOT_RECORDED = "not_recorded"
 
-CALLS = (
+CALLS = (  # names of the methods that are served over XML-RPC
     "begin",
     "add",
     "decide",
@@ -61,7 +60,8 @@ CALLS = (
     "status",
 )
 Struct = dict[str, Any]
-Call = Callable[..., Awaitable[Any]]
+# A VERIFY that was not recorded, but for its reason.
+UNRECORDED: Struct = {"action": 0, "id": "", "lower": 0.0, "upper": 1.0, "version": 0}
 
 
 class RobotCalls:
@@ -80,10 +80,6 @@ class RobotCalls:
         self._pieces: OrderedDict[str, list[TraceArray]] = OrderedDict()
         self._armed: str | None = None  # id of the part that is recorded
         self._recorder_lock = asyncio.Lock()
-
-    def table(self) -> dict[str, Call]:
-        """Return each method by its name; its signature says which arguments it takes."""
-        return {name: getattr(self, name) for name in CALLS}
 
     async def begin(self, request: Any = "") -> str:
         """Begin a new part, and have the recorder wait for its insertion.
@@ -263,13 +259,13 @@ class RobotCalls:
                 return stored
             # Another part was begun, or the server was restarted meanwhile.
             if id_ is None or id_ != self._armed:
-                return _unrecorded_verify(NOT_RECORDED)
+                return UNRECORDED | {"reason": NOT_RECORDED}
             self._armed = None
             try:
                 recording = await asyncio.to_thread(self._recorder.record, RECORD_SECONDS)
             except (DengineError, OSError) as error:
                 log.warning("no recording of %s: %s", shortened(id_), error)
-                return _unrecorded_verify(NOT_RECORDED)
+                return UNRECORDED | {"reason": NOT_RECORDED}
             return await self.decide_array(recording.trace, id_, part)
 
     async def action(self, trace: Any, request: Any, part: Any = "") -> int:
@@ -304,7 +300,7 @@ class RobotCalls:
             response = await self._service.decide(trace, id_, None if part == "" else part)
         except (BusyError, StoreError) as error:
             log.warning("verified without a record: %s", error)
-            return _unrecorded_verify(BUSY)
+            return UNRECORDED | {"reason": BUSY}
         return _as_struct(response.decision)
 
     async def report(self, decision_id: Any, success: Any) -> bool:
@@ -405,19 +401,4 @@ def _as_struct(decision: Decision) -> Struct:
         "lower": decision.lower,
         "upper": decision.upper,
         "version": decision.model_version,
-    }
-
-
-def _unrecorded_verify(reason: str) -> Struct:
-    """Return the dict of a VERIFY that was not recorded, for a robot, with the given reason.
-
-    Its action is 0, its id "", its version 0, and its lower and upper bound are 0 and 1.
-    """
-    return {
-        "action": ACTIONS.index(Action.VERIFY),
-        "id": "",
-        "reason": reason,
-        "lower": 0.0,
-        "upper": 1.0,
-        "version": 0,
     }

@@ -6,16 +6,21 @@ It puts the engine's service, the HTTP application and uvicorn together.
 
 from __future__ import annotations
 
+import asyncio
 import json
 import logging
 import signal
 import socket
-import ssl
 import sys
-import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor
-from contextlib import AbstractContextManager, closing, contextmanager, nullcontext
+from contextlib import (
+    AbstractAsyncContextManager,
+    AbstractContextManager,
+    AsyncExitStack,
+    closing,
+    contextmanager,
+)
 from functools import partial
 from pathlib import Path
 from types import FrameType
@@ -26,13 +31,15 @@ import uvicorn
 from ..engine.engine import DataEngine
 from ..engine.garbage import frozen_objects
 from ..errors import SettingError, instead, log, without_password
-from .auth import host_in_url, is_loopback, read_tokens
-from .http import Beside, create_app
-from .retraining import END_SIGNALS, RetrainingProcess
+from .auth import check_key_pair, host_in_url, is_loopback, read_tokens
+from .http import create_app
+from .retraining import RetrainingProcess
 from .service import CellService
 
 if TYPE_CHECKING:
     from ..cells.ur.recorder import RtdeRecorder
+
+Beside = Callable[[CellService], AbstractAsyncContextManager[object]]
 
 KEEP_ALIVE = 75  # seconds that a connection may be idle: a robot's next part comes in this time
 GRACE = 5  # seconds for requests under way when the server ends
@@ -46,9 +53,8 @@ UVICORN_OPTIONS: dict[str, Any] = {
     "limit_concurrency": MAX_CONNECTIONS,
     "timeout_keep_alive": KEEP_ALIVE,
     "timeout_graceful_shutdown": GRACE,
-    "loop": "auto",  # uvloop if that is installed
     "ws": "none",
-    "lifespan": "on",
+    "lifespan": "off",
     "server_header": False,
     "proxy_headers": False,
     "log_config": None,
@@ -87,8 +93,8 @@ def serve(
     make: Callable[[Executor], DataEngine],
     store: str | None,
     say: Callable[[str], object],
-    beside: Sequence[Beside] = (),
-    recorder: Callable[[], AbstractContextManager[RtdeRecorder | None]] = nullcontext,
+    beside: Sequence[Beside],
+    recorder: Callable[[], AbstractContextManager[RtdeRecorder | None]],
     *,
     host: str,
     port: int,
@@ -105,7 +111,7 @@ def serve(
 
     Then the requests in the queue are answered, and the engine is closed. Logs go to stderr, a line
     each, also after the end (`log_lines`). In another thread than the main thread no signal ends
-    it.
+    it, and before it listens a signal ends the process as it does in any program.
 
     Parameters
     ----------
@@ -116,8 +122,9 @@ def serve(
     say : callable
         Called with a line that says where the server listens, once it does.
     beside : sequence of callable
-        Each is called with the service and returns an async context that lasts as long as the
-        server. If one fails to start, the server ends, and the error is raised.
+        Each is called with the service and returns an async context, which lasts as long as the
+        server, in the same event loop. If one fails to start, the server does not listen, and the
+        error is raised.
     recorder : callable
         Returns a context manager that opens the recorder of a robot's insertions for as long as the
         server runs, or gives None.
@@ -154,17 +161,15 @@ def serve(
             "--host 127.0.0.1."
         )
     tokens = () if token_file is None else read_tokens(token_file)
-    tls = _tls_options(cert, key)
+    check_key_pair(cert, key)
     if opcua is not None:
         from .opcua import opcua_server
 
-        # A viewer's token is no password: whoever may read over OPC UA may also call.
-        secrets = [token.secret for token in tokens if token.operates]
         start = partial(
             opcua_server,
             port=opcua,
             host=host,
-            tokens=secrets if tokens else None,
+            tokens=tokens,
             cert=opcua_cert or cert,
             key=opcua_key or key,
         )
@@ -177,23 +182,27 @@ def serve(
     ):
         service = CellService(lambda: make(executor), store, deadline, check_seconds=check_seconds)
         with closing(service):
-            app = create_app(service, tokens, beside=beside, recorder=opened_recorder)
-            config = uvicorn.Config(app, **UVICORN_OPTIONS | tls)
-            scheme = "https" if tls else "http"
+            app = create_app(service, tokens, recorder=opened_recorder)
+            scheme = "http" if cert is None else "https"
+            options = UVICORN_OPTIONS | {"ssl_certfile": cert, "ssl_keyfile": key}
             address = f"{scheme}://{host_in_url(host)}:{listening.getsockname()[1]}"
             audience = "" if tokens else ", to this machine alone"
             line = f"{service.engine.store.cell_id} is served at {address}{audience}."
-            server = CellServer(config, service, lambda: say(line))
-            try:
-                with quick_switches():
-                    server.run([listening])
-            except SystemExit:  # as uvicorn says that the application did not start
-                failure = SettingError("The server did not start; its log says why.")
-                raise getattr(app.state, "failure", failure) from None
+            server = CellServer(uvicorn.Config(app, **options), service, lambda: say(line))
+
+            async def run() -> None:
+                """Start what runs beside the server, and serve until a signal comes."""
+                async with AsyncExitStack() as stack:
+                    for start in beside:
+                        await stack.enter_async_context(start(service))
+                    await server.serve([listening])
+
+            with quick_switches():
+                asyncio.run(run())
 
 
 class CellServer(uvicorn.Server):
-    """A uvicorn server that says when it listens, and ends in order with exit code 0.
+    """A uvicorn server that says when it listens, and whose process ends with exit code 0.
 
     Parameters
     ----------
@@ -211,38 +220,22 @@ class CellServer(uvicorn.Server):
         self._say = say
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
-        """Start the application and listen; call `say` unless the start failed."""
+        """Listen, and call `say`."""
         await super().startup(sockets)
-        if not self.should_exit:
-            self._say()
+        self._say()
 
-    @contextmanager
-    def capture_signals(self) -> Iterator[None]:
-        """Handle SIGINT, SIGTERM and Ctrl-Break, within the block, as a request to end in order.
+    def handle_exit(self, sig: int, frame: FrameType | None) -> None:
+        """Handle SIGINT, SIGTERM and Ctrl-Break as a request to end in order.
 
         Each signal is logged, ends every iteration over `CellService.changes`, and asks uvicorn to
         end after the requests under way, which have `GRACE` seconds; a SIGINT after another of
-        these signals makes it end without waiting for them. The earlier handlers are set again
-        after the block. The signals are not raised again then, unlike by uvicorn's own method, so
-        the exit code is 0. In another thread than the main thread no handler is set.
+        these signals makes it end without waiting for them. Unlike uvicorn's own method it does not
+        note the signal to be raised again after the end, so the exit code is 0.
         """
-        # Python delivers signals to the main thread alone.
-        if threading.current_thread() is not threading.main_thread():
-            yield
-            return
-
-        def end(number: int, frame: FrameType | None) -> None:
-            """Log the signal, end the listening to changes, and ask uvicorn to end."""
-            log.info("%s: ending, what is in line is answered", signal.Signals(number).name)
-            self._service.end_listening()
-            self.handle_exit(number, frame)
-
-        before = {number: signal.signal(number, end) for number in END_SIGNALS}
-        try:
-            yield
-        finally:
-            for number, handler in before.items():
-                signal.signal(number, handler)
+        log.info("%s: ending, what is in line is answered", signal.Signals(sig).name)
+        self._service.end_listening()
+        self.force_exit = self.force_exit or (self.should_exit and sig == signal.SIGINT)
+        self.should_exit = True
 
 
 @contextmanager
@@ -265,8 +258,9 @@ def quick_switches() -> Iterator[None]:
 
 @contextmanager
 def listening_socket(host: str, port: int) -> Iterator[socket.socket]:
-    """Open a listening TCP socket at the host's first address, yield it, and close it when the
-    block ends.
+    """Open a listening TCP socket, yield it, and close it when the block ends.
+
+    The host is an address, or a name that has an address of IPv4.
 
     Port 0 takes a free port. Raises SettingError if the socket cannot be opened, for example
     because the port is in use or the host is unknown.
@@ -279,35 +273,13 @@ def listening_socket(host: str, port: int) -> Iterator[socket.socket]:
         UnicodeError,
         do="name another port or address, --port or --host",
     ):
-        addresses = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
-        family, _, _, _, address = addresses[0]
-        listening = socket.create_server(address[:2], family=family, backlog=128)
+        family = socket.AF_INET6 if ":" in host else socket.AF_INET
+        listening = socket.create_server((host, port), family=family)
     with listening:
         # Its connections inherit this option. Without it the second piece of a response waits 40 ms
         # for the confirmation of the first.
         listening.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         yield listening
-
-
-def _tls_options(cert: Path | None, key: Path | None) -> dict[str, str]:
-    """Return uvicorn's options for TLS with a certificate and its key, both PEM files.
-
-    Without both the dict is empty. The files are loaded once to check them. Raises SettingError for
-    only one of the two, for files that cannot be used, and for a key with a password.
-    """
-    if cert is None and key is None:
-        return {}
-    if cert is None or key is None:
-        raise SettingError("Expected --cert and --key together, got one of them.")
-    # OSError includes ssl.SSLError. Without a password OpenSSL would ask the terminal for one.
-    with instead(
-        SettingError,
-        f"Cannot use {cert} and {key} for TLS",
-        OSError,
-        do="use PEM files, and a key without a password",
-    ):
-        ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER).load_cert_chain(cert, key, password="none")
-    return {"ssl_certfile": str(cert), "ssl_keyfile": str(key)}
 
 
 def log_safe_mode(reason: str) -> None:

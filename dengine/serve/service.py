@@ -20,7 +20,7 @@ import uuid
 from collections.abc import AsyncIterator, Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
@@ -29,7 +29,7 @@ from numpy.typing import ArrayLike
 from ..engine.engine import DataEngine
 from ..errors import BusyError, NotTakenError, ReportConflictError, log
 from ..files import FilePath
-from ..history.status import NEWEST, Status, status
+from ..history.status import Status, status
 from ..records import Decision, PartNumber, Reason, RetrainReport, as_id, as_success
 from ..store.opening import open_store
 from ..store.records import StoredDecision
@@ -61,7 +61,7 @@ class Job(NamedTuple):
 
     future: Future[Any]
     work: Callable[[DataEngine, bool], Any]
-    read_only: bool = False
+    read_only: bool
 
     def run(self, engine: DataEngine) -> None:
         """Do the work with the engine, and set the future's result or exception.
@@ -89,17 +89,15 @@ class ServiceResponse:
     ----------
     decision : Decision
         As recorded.
+    late : bool
+        Whether it is VERIFY because the deadline passed while the request waited.
     seconds : float
         From the request to the response.
     """
 
-    decision: Decision
+    decision: Decision = field(metadata={"flat": True})
+    late: bool
     seconds: float
-
-    @property
-    def late(self) -> bool:
-        """Whether the decision is VERIFY because the deadline passed while the request waited."""
-        return self.decision.reason is Reason.LATE
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,8 +164,7 @@ class CellService:
         self.check_seconds = check_seconds
         self.late = 0
         self.busy = 0
-        self.observers: list[Callable[[ServiceResponse | ReportResponse | RetrainReport], object]]
-        self.observers = []
+        self.observers: list[Callable[[Any], object]] = []
         self._jobs: queue.Queue[Job | None] = queue.Queue(max_waiting)
         # The default executor may be full of readers of a store that is unavailable.
         self._timeout_threads = ThreadPoolExecutor(max_waiting, "dengine-late")
@@ -240,7 +237,7 @@ class CellService:
             decision_id = id_ if late or request is not None else None
             return engine.decide(trace, part, decision_id=decision_id, timed_out=late)
 
-        future = self._enqueue(work)
+        future = self.submit(work)
         pending = asyncio.wrap_future(future)
         await asyncio.wait([pending], timeout=self.deadline)
         if pending.done() or not future.cancel():
@@ -250,7 +247,8 @@ class CellService:
             loop = asyncio.get_running_loop()
             decision = await loop.run_in_executor(self._timeout_threads, record)
             self.late += 1
-        response = ServiceResponse(decision, time.monotonic() - begin)
+        is_late = decision.reason is Reason.LATE
+        response = ServiceResponse(decision, is_late, time.monotonic() - begin)
         return self._notify_observers(response)
 
     async def report(self, decision_id: str, success: float, author: str = "") -> ReportResponse:
@@ -296,17 +294,21 @@ class CellService:
             once more. A new label with an author is recorded as an event. Raises the errors of
             `CellService.report`.
             """
-            stored = engine.find(decision_id)
-            if stored is not None and stored.success is label:
+
+            def has_label() -> bool:
+                """Return whether the decision has the reported label already."""
+                stored = engine.find(decision_id)
+                return stored is not None and stored.success is label
+
+            if has_label():
                 return True, None
             try:
                 retrain = engine.report(decision_id, label)
             except ReportConflictError:
                 engine.flush()  # a confirmation by the next decision may not have been on disk yet
-                stored = engine.find(decision_id)
-                if stored is None or stored.success is not label:
-                    raise
-                return True, None
+                if has_label():
+                    return True, None
+                raise
             if author:
                 engine.store.events.put(
                     "report",
@@ -337,15 +339,28 @@ class CellService:
         and listeners to `changes` are not notified. Raises BusyError if the queue is full or the
         service is closing; nothing is called then.
         """
-        return await asyncio.wrap_future(self.submit(work, read_only))
+        return await asyncio.wrap_future(self.submit(lambda engine, late: work(engine), read_only))
 
-    def submit(self, work: Callable[[DataEngine], T], read_only: bool = False) -> Future[T]:
-        """Put a function, as `call` takes it, into the queue, from any thread; return a future of
-        its result.
+    def submit(self, work: Callable[[DataEngine, bool], T], read_only: bool = False) -> Future[T]:
+        """Put work into the queue for the engine's thread, from any thread, and return its future.
 
-        Raises BusyError if the queue is full or the service is closing.
+        `work` is called with the engine and with whether the future was cancelled. A cancelled
+        future does not stop the work, but the result is dropped. After the work every iteration
+        over `changes` goes on, unless the work is `read_only`. Raises BusyError if the service is
+        closing, or if the queue is full; only a full queue is counted, in `busy`.
         """
-        return self._enqueue(lambda engine, late: work(engine), read_only)
+        job = Job(Future(), work, read_only)
+        if self._closing or not self._thread.is_alive():
+            raise BusyError(CLOSING)
+        try:
+            self._jobs.put_nowait(job)
+        except queue.Full:
+            self.busy += 1
+            raise BusyError(
+                f"Expected at most {self._jobs.maxsize} requests in line: verify the part, "
+                "nothing of it was recorded."
+            ) from None
+        return job.future
 
     async def read(self, work: Callable[[SqlStore], T]) -> T:
         """Let the engine write all that it has recorded to the store, call `work` with the store,
@@ -364,14 +379,14 @@ class CellService:
             return await self.call(lambda engine: work(engine.store), read_only=True)
         return await asyncio.to_thread(work, self.read_store)
 
-    async def status(self, last: int = NEWEST, watching: bool = False) -> Status:
+    async def status(self, watching: bool = False) -> Status:
         """Return the status that `DataEngine.status` returns, but read the store like `read`.
 
-        `last` and `watching` are the arguments of `DataEngine.status`. Raises BusyError if the
+        `watching` is the argument of `DataEngine.status`. Raises BusyError if the
         queue is full or the service is closing, StoreError if the store cannot be read, and
         SettingError for a stored recipe that cannot be read.
         """
-        stored = await self.read(lambda store: status(store, last, watching))
+        stored = await self.read(lambda store: status(store, watching=watching))
         return self.engine.state.complete(stored)
 
     @property
@@ -386,13 +401,12 @@ class CellService:
             return float("inf")
         return time.monotonic() - self._last_active
 
-    async def changes(self, quiet: float | None = None) -> AsyncIterator[bool]:
+    async def changes(self, quiet: float) -> AsyncIterator[bool]:
         """Yield True at once, and then whenever something has changed since the last yield.
 
         A change is each call of the engine that is not read-only, even if it raised, and each
-        retrain that has ended. After `quiet` seconds without a change False is yielded; None:
-        never. The iteration ends when `end_listening` is called, and yields nothing if it was
-        called before.
+        retrain that has ended. After `quiet` seconds without a change False is yielded. The
+        iteration ends when `end_listening` is called, and yields nothing if it was called before.
         """
         event = asyncio.Event()
         listener = (asyncio.get_running_loop(), event)
@@ -436,27 +450,6 @@ class CellService:
         if self.read_store is not self.engine.store:
             self.read_store.close()
 
-    def _enqueue(self, work: Callable[[DataEngine, bool], T], read_only: bool = False) -> Future[T]:
-        """Put work into the queue for the engine's thread, and return a future of its result.
-
-        `work` is called with the engine and with whether the future was cancelled. A cancelled
-        future does not stop the work, but the result is dropped. After the work every iteration
-        over `changes` goes on, unless the work is `read_only`. Raises BusyError if the service is
-        closing, or if the queue is full; only a full queue is counted, in `busy`.
-        """
-        job = Job(Future(), work, read_only)
-        if self._closing or not self._thread.is_alive():
-            raise BusyError(CLOSING)
-        try:
-            self._jobs.put_nowait(job)
-        except queue.Full:
-            self.busy += 1
-            raise BusyError(
-                f"Expected at most {self._jobs.maxsize} requests in line: verify the part, "
-                "nothing of it was recorded."
-            ) from None
-        return job.future
-
     def _notify_observers(self, response: T) -> T:
         """Call each function in `observers` with a response or a `RetrainReport`; return the
         argument.
@@ -473,7 +466,7 @@ class CellService:
                 response.reason,
             )
         for observe in self.observers:
-            observe(response)  # type: ignore[arg-type]  # only what the list is of
+            observe(response)
         return response
 
     def _run_jobs(self, make: Callable[[], DataEngine], opened: Future[DataEngine]) -> None:

@@ -11,21 +11,18 @@ from __future__ import annotations
 import asyncio
 import xmlrpc.client
 from inspect import signature
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from defusedxml.xmlrpc import DefusedExpatParser  # type: ignore[import-untyped]
+from starlette.exceptions import HTTPException
 from starlette.requests import Request
-from starlette.responses import PlainTextResponse, Response
+from starlette.responses import Response
 from starlette.routing import Route
 
 from ..errors import DengineError, ReportError, as_options, log
 from .api import media_type
 from .auth import RPC
-from .robot_calls import Call, RobotCalls, one_line
-from .service import CellService
-
-if TYPE_CHECKING:
-    from ..cells.ur.recorder import RtdeRecorder
+from .robot_calls import CALLS, RobotCalls, one_line
 
 # Codes of faults. Negative ones are those that XML-RPC servers agreed on.
 NOT_XML = -32700
@@ -57,45 +54,33 @@ def parse_call(body: bytes) -> tuple[str, tuple[Any, ...]]:
     return name, arguments
 
 
-def routes(service: CellService, recorder: RtdeRecorder | None = None) -> list[Route]:
-    """Return a list with the route of POST /RPC2, which calls the methods of `RobotCalls`.
-
-    Parameters
-    ----------
-    service : CellService
-    recorder : RtdeRecorder, optional
-        Records the traces for `decide_recorded`; the caller closes it.
-
-    Returns
-    -------
-    list of Route
-    """
-    calls = RobotCalls(service, recorder).table()
+def rpc_route(calls: RobotCalls) -> Route:
+    """Return the route of POST /RPC2, which calls the methods of `calls`."""
 
     async def rpc(request: Request) -> Response:
-        """Respond to a call with a value or a fault as XML; another media type gets 415."""
+        """Respond with a value or a fault in XML; HTTPException 415 for another media type."""
         if media_type(request) not in ("text/xml", "application/xml"):
-            return PlainTextResponse("Expected an XML-RPC call, Content-Type: text/xml.\n", 415)
+            raise HTTPException(415, "Expected an XML-RPC call, Content-Type: text/xml.")
         xml = await call_method(calls, await request.body())
         return Response(xml, media_type="text/xml")
 
-    return [Route(RPC, rpc, methods=["POST"])]
+    return Route(RPC, rpc, methods=["POST"])
 
 
-async def call_method(calls: dict[str, Call], body: bytes) -> bytes:
+async def call_method(calls: RobotCalls, body: bytes) -> bytes:
     """Call the method that an XML-RPC request names, and return its value or a fault as XML.
 
-    `calls` has the methods by name, and `body` is the request. It raises nothing: a body that
-    cannot be read, an unknown method, wrong arguments and each error of the method become faults,
-    with a code and one line of text. An unexpected error is logged.
+    `calls` has the methods, of which those in `CALLS` may be called, and `body` is the request. It
+    raises nothing: a body that cannot be read, an unknown method, wrong arguments and each error of
+    the method become faults, with a code and one line of text. An unexpected error is logged.
     """
     try:
         name, arguments = await asyncio.to_thread(parse_call, body)
     except ValueError as error:
         return fault(NOT_XML, str(error))
-    if name not in calls:
-        return fault(NO_METHOD, f"Expected one of {', '.join(calls)}.")
-    call = calls[name]
+    if name not in CALLS:
+        return fault(NO_METHOD, f"Expected one of {', '.join(CALLS)}.")
+    call = getattr(calls, name)
     try:
         signature(call).bind(*arguments)
     except TypeError as error:

@@ -120,7 +120,7 @@ def test_the_unit_starts_serve_with_the_options_of_its_file_and_its_token_as_a_c
 
 def test_dashboard_and_alerts_ask_for_metrics_actions_and_reasons_that_there_are():
     with a_service() as service:
-        names = re.findall(r"^# TYPE (\w+)", Metrics(service).text()[0].decode(), flags=re.M)
+        names = re.findall(r"^# TYPE (\w+)", Metrics(service).text().decode(), flags=re.M)
     texts = [(DEPLOY / name).read_text(encoding="utf-8") for name in ("grafana.json", "alerts.yml")]
     exprs = re.findall(r'"expr": "((?:[^"\\]|\\.)+)"', texts[0])
     exprs += re.findall(

@@ -29,7 +29,7 @@ from dengine.decision.rule import DecisionRule
 from dengine.errors import ExportError
 from dengine.export import ExportedModel
 from dengine.export.bundle import metadata_of, read_checked
-from dengine.export.decision import FIELDS, METHODS
+from dengine.export.decision import FIELDS
 from dengine.records import ACTIONS, REASONS, Action
 from tests.support.exports import (
     LIMIT,
@@ -73,6 +73,9 @@ def a_stream(
         yield x, bool(y) != (0.6 < share < 0.75 and rng.random() < 0.4), part
 
 
+METHODS = "forward decide learn stop settle safe_mode restore predicted drop n_references"
+
+
 def test_a_plain_torch_load_decides_by_calling_the_module_and_reads_the_seven_fields(
     file, make_data
 ):
@@ -85,7 +88,7 @@ def test_a_plain_torch_load_decides_by_calling_the_module_and_reads_the_seven_fi
         assert ACTIONS[called["action"]] == expected.action
         assert REASONS[called["reason"]] == expected.reason
         assert [*called.values()][2:6] == [*expected[2:6]]
-    assert [name for name in METHODS if not hasattr(plain, name)] == []
+    assert [name for name in METHODS.split() if not hasattr(plain, name)] == []
 
 
 LEARNED = """references.points references.parts references.repeats references.total
@@ -196,7 +199,9 @@ def test_every_damaged_file_is_refused(copy, kind):
         flipped, other_block = bytes([content[i] ^ 1 << j % 8]), content[j : j + 512]
         written = {"flip": flipped, "truncation": b"", "swap": other_block}[kind]
         rest = b"" if kind == "truncation" else content[i + len(written) :]
-        copy.write_bytes(content[:i] + written + rest)
+        copy.write_bytes(changed := content[:i] + written + rest)
+        if changed == content:  # both blocks are padding
+            continue
         with pytest.raises(ExportError, match="is damaged or truncated: its SHA-256 is"):
             load_exported(copy)
 

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dengine import Action, DataEngine, Dataset, TraceSpec
+from dengine import Action, Dataset, TraceSpec
 from dengine.store.sql import SqlStore
 from tests.support.serving import a_service, served, started
 
@@ -167,7 +167,7 @@ def test_versions_are_rolled_back_released_and_trained_and_a_label_corrected_by_
 ):
     with cell(tmp_path / "cell.db") as (service, demo), looking(browser) as page:
         played(service, stream, 40)
-        service.submit(DataEngine.retrain).result()
+        service.submit(lambda engine, late: engine.retrain()).result()
         opened(page, demo, "actions")
         confirmed(page, "Roll back", AUTHOR)
         expect(page.locator("#result")).to_contain_text("Version 1 answers again")

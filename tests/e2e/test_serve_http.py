@@ -147,7 +147,7 @@ def test_a_label_is_taken_once_and_not_against_itself(client, stream):
 
 
 LOOKS = """
-status?watch=true&last=7         Status
+status?watch=true                Status
 healthz                          Health
 decisions?limit=3                Decisions
 decisions/missing%2Fsample%20%3F Decision
@@ -158,7 +158,7 @@ versions                         Versions
 me                               Me
 events?limit=3                   Events
 """
-WRONG_LOOKS = """events?limit=0 status?last=0 course?hours=5e-324 decisions?limit=0 decisions?limit=x
+WRONG_LOOKS = """events?limit=0 status?watch=2 course?hours=5e-324 decisions?limit=0 decisions?limit=x
 decisions?open=yes decisions?label=fine decisions?since=monday decisions?limit=9999"""
 
 
@@ -168,7 +168,7 @@ def test_what_can_be_looked_at_is_as_the_document_says_also_of_a_trace_that_lack
     trace = [*stream.X[8].tolist()[:-1], None]
     answer = client.ask("/decide", trace=trace, request="missing/sample ?").json()
     assert (answer["action"], answer["reason"]) == ("verify", "not_finite")
-    shown = client.get("/decisions/missing%2Fsample%20%3F?trace=true").json()
+    shown = client.get("/explanations/missing%2Fsample%20%3F").json()
     assert shown["trace"][0][-1] is None
     for path, schema in rows(LOOKS):
         validate(client.get(path).json(), schema, client)
@@ -268,7 +268,7 @@ def test_the_page_is_files_that_may_ask_nobody_else(client):
         assert client.get(unknown).status_code == 404
 
 
-def test_the_document_names_every_route_and_every_example_is_served(client):
+def test_the_document_names_every_route(client):
     document = client.get("/openapi.json").json()
     with a_service() as service:
         app = create_app(service)
@@ -280,16 +280,6 @@ def test_the_document_names_every_route_and_every_example_is_served(client):
     }
     named = {(path, method) for path, methods in document["paths"].items() for method in methods}
     assert routes == named
-    for path, method in named:
-        contents = document["paths"][path][method].get("requestBody", {}).get("content", {})
-        for content in contents.values():
-            schema = {**content["schema"], "components": document["components"]}
-            for example in content.get("examples", {}).values():
-                jsonschema.validate(example["value"], schema)
-                answer = client.post(path, json=example["value"])
-                # Of another contract, or unknown here.
-                assert answer.status_code in (200, 404, 422), answer.text
-                assert re.search("unknown|does not hold|samples|channel", answer.text)
 
 
 METRICS = """
@@ -368,7 +358,7 @@ def test_what_is_no_trace_is_refused_and_leaves_nothing(client, stream):
 
 def test_a_full_line_says_verify_and_when_to_come_again(stream):
     with serving(most=1) as (service, client), busy_engine(service):
-        service.submit(lambda engine: None)
+        service.submit(lambda engine, late: None)
         answer = client.decide(stream.X[0], "order-0")
         must_be_problem(answer, 503)
         assert int(answer.headers["retry-after"]) >= 1
@@ -506,7 +496,7 @@ NOT_STARTED = """
 644; --token-file DIR/token; chmod 600
 600; --token-file DIR/token; at least 16 ASCII characters
 600; --token-file DIR/none; Cannot read the token file
-600; --cert DIR/cert.pem --host localhost; --cert and --key together
+600; --cert DIR/cert.pem --host localhost; a certificate and its key together
 600; --cert DIR/cert.pem --key DIR/locked.pem --host localhost; a key without a password
 """
 

@@ -73,7 +73,7 @@ def test_the_engine_does_what_it_has_to_while_nobody_asks(stream):
     async def cell(service):
         for x, good in zip(stream.X[:40], stream.y, strict=False):
             await service.report((await service.decide(x)).decision.id, bool(good))
-        changes = service.changes()
+        changes = service.changes(WAIT)
         while service.engine.version == 0:
             await asyncio.wait_for(anext(changes), 60)
         await changes.aclose()

@@ -17,7 +17,7 @@ import pytest
 
 pytest.importorskip("uvicorn", reason="XML-RPC needs the extra `serve`")
 
-from dengine import Action, DataEngine
+from dengine import Action
 from dengine.serve.http import create_app
 from dengine.store.views import HistoryFilter
 from tests.support.serving import PushedTraces, a_service, busy_engine, served
@@ -159,7 +159,7 @@ def test_a_shift_of_the_program_decides_checks_and_reports(cell, make_data):
     data = make_data(90, samples=SAMPLES, seed=3)
     robot = Robot(data, cell)
     robot.play()
-    cell.service.submit(DataEngine.flush).result(60)
+    cell.service.submit(lambda engine, late: engine.flush()).result(60)
     result = cell.service.read_store.decisions.select(HistoryFilter(), 1000)
     assert len(result) == len(data)
     actions = [item.decision.action for item in result]

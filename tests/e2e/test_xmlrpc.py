@@ -16,7 +16,7 @@ pytest.importorskip("uvicorn", reason="XML-RPC needs the extra `serve`")
 from dengine.errors import BusyError
 from dengine.serve import xmlrpc as xml_rpc
 from dengine.serve.http import create_app
-from dengine.serve.robot_calls import MAX_SAMPLES, RobotCalls
+from dengine.serve.robot_calls import CALLS, MAX_SAMPLES
 from tests.support.serving import PushedTraces, a_service, busy_engine, served
 from tests.support.tables import rows
 
@@ -128,7 +128,7 @@ def test_a_busy_server_answers_verify_and_keeps_no_report(cell, stream):
     with busy_engine(cell.service):
         with suppress(BusyError):
             while True:
-                waiting.append(cell.service.submit(lambda engine: None))
+                waiting.append(cell.service.submit(lambda engine, late: None))
         answer = robot.decide(stream.X[0].tolist(), "too much")
         assert (answer["action"], answer["id"], answer["reason"]) == (VERIFY, "", "busy")
         assert robot.decide_recorded(recorded) == answer
@@ -207,5 +207,5 @@ def test_another_media_type_is_refused_and_the_page_names_every_call(cell, repo)
     assert post(cell, body, "application/json")[0] == 415
     assert post(cell, body, "text/xml; charset=utf-8")[0] == 200
     page = (repo / "docs" / "howto" / "plc_and_robot.md").read_text(encoding="utf-8")
-    for name in RobotCalls(cell.service).table():
+    for name in CALLS:
         assert f"`{name}" in page

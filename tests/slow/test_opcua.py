@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from dengine.errors import SettingError
+from dengine.serve.auth import Token
 from dengine.store.views import HistoryFilter
 from tests.support.serving import a_service, certificate
 from tests.support.tables import rows
@@ -22,6 +23,7 @@ from dengine.serve import opcua
 
 pytestmark = pytest.mark.anyio
 VERIFY, ACCEPT = 0, 1
+TOKENS = Token("s3cret"), Token("viewer", operates=False)
 FLOAT, TEXT, COUNT = ua.VariantType.Float, ua.VariantType.String, ua.VariantType.UInt32
 
 
@@ -231,7 +233,7 @@ async def test_a_store_that_cannot_be_read_leaves_values_that_say_they_are_old(p
     "options",
     [
         {"host": "0.0.0.0"},
-        {"host": "0.0.0.0", "tokens": ["a token"]},
+        {"host": "0.0.0.0", "tokens": TOKENS},
         {"host": "0.0.0.0", "cert": "c.pem", "key": "k.pem"},
         {"cert": "c.pem"},
     ],
@@ -261,10 +263,15 @@ async def test_with_a_certificate_only_who_encrypts_and_knows_the_token_gets_in(
             index = await client.get_namespace_index(opcua.NAMESPACE)
             return await client.get_node(ua.NodeId("Cell.ModelVersion", index)).read_value()
 
-    async with opcua.opcua_server(service, 0, "127.0.0.1", ["s3cret"], cert, key) as server:
+    async with opcua.opcua_server(service, 0, "127.0.0.1", TOKENS, cert, key) as server:
         encrypted = f"Basic256Sha256,SignAndEncrypt,{cert},{key}"
         assert await connect("dengine", "s3cret", encrypted) == service.engine.version
-        for user, password in (("dengine", "wrong"), ("admin", "s3cret"), ("", "")):
+        for user, password in (
+            ("dengine", "wrong"),
+            ("admin", "s3cret"),
+            ("", ""),
+            ("dengine", "viewer"),
+        ):
             with pytest.raises((ua.UaError, ConnectionError, TimeoutError)):
                 await connect(user, password, encrypted)
         # A client that does not care for what the server's endpoints are gets no session either.

@@ -141,7 +141,7 @@ class PushedTraces:
 def busy_engine(service: Any) -> Iterator[None]:
     """The engine's thread, busy with something else."""
     begun, free = threading.Event(), threading.Event()
-    service.submit(lambda engine: (begun.set(), free.wait(60)))
+    service.submit(lambda engine, late: (begun.set(), free.wait(60)))
     assert begun.wait(60)
     try:
         yield

@@ -29,7 +29,7 @@ from .damage import SAMPLES, nested, spoilt, tries
 JSON, RAW, XML = "application/json", "application/octet-stream", "text/xml"
 GOOD = [float(i % 7) for i in range(SAMPLES)]
 PATHS = """/decide /report /status /decisions /decisions/x /metrics /healthz /docs /RPC2 /RPC2/wrong /me / /explanations/
-/explanations/known-0 /course /embedding /versions /events?limit= /status?last= /correct /forget /rollback /policy /retrain
+/explanations/known-0 /course /embedding /versions /events?limit= /status?watch= /correct /forget /rollback /policy /retrain
 /part?id= /map?id= /history?page= /page/static/ // /.env /%ff%fe /../../etc/passwd /decisions/..%2f..%2fetc%2fpasswd
 /decisions/%00 /decisions?limit= /decisions?open= /decisions?before= /decisions?since= /RPC2?token="""
 ODD = "x %00 -1 1e999 LONG %ff ';-- <script> %0d%0aSet-Cookie:a=b ../../x"  # ends of a path
@@ -127,7 +127,7 @@ def send(port: int, sent: bytes, ended: bool = False) -> bytes:
 
 
 def read_decisions(service: CellService) -> dict[str, str]:
-    service.submit(DataEngine.flush).result(60)
+    service.submit(lambda engine, late: engine.flush()).result(60)
     store = service.read_store.decisions
     ids = [item.decision.id for item in store.select(HistoryFilter(), 10**6)]
     return {item.decision.id: f"{item} {item.trace.tolist()}" for item in map(store.get, ids)}

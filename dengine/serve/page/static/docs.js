@@ -13,10 +13,7 @@ function list(schemas) {
 }
 
 function operation(path, method, description) {
-  const body = Object.entries(description.requestBody?.content ?? {}).flatMap(([kind, content]) => [
-    el("p", {}, "Takes ", code(kind), ": ", typed(content, "bytes"), "."),
-    Object.values(content.examples ?? {}).map((example) => el("pre", {}, JSON.stringify(example.value))),
-  ]);
+  const body = Object.entries(description.requestBody?.content ?? {}).map(([kind, content]) => el("p", {}, "Takes ", code(kind), ": ", typed(content, "bytes"), "."));
   const responses = Object.entries(description.responses["200"].content).map(([kind, content]) => el("p", {}, "Returns ", typed(content, kind), "."));
   const parameters = Object.fromEntries(description.parameters.map(({ name, schema }) => [name, schema]));
   return [el("h2", {}, code(`${method.toUpperCase()} ${path}`)), el("p", {}, description.summary), list(parameters), body, responses];
