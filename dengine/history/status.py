@@ -668,9 +668,10 @@ def read_course(store: SqlStore, recipe: Recipe, last: int, **by: Any) -> Course
         Number of newest decisions that the picture marks. It is copied to `Course.last` and has no
         other effect.
     **by
-        `seconds` and `start`, for stretches that are periods of time (see `stretches_query`); only
-        the newest 120 with decisions are returned. Without them all decisions of the cell are split
-        into at most 120 stretches of equal number, at least 20 each; the newest may have fewer.
+        `seconds` and `start`, for stretches that are periods of time (`DecisionTable.stretches`);
+        only the newest 120 with decisions are returned. Without them all decisions of the cell are
+        split into at most 120 stretches of equal number, at least 20 each; the newest may have
+        fewer.
 
     Returns
     -------

@@ -8,14 +8,11 @@ of cells use `reading`.
 
 import hashlib
 import os
-import shutil
 import sqlite3
 import threading
-import weakref
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any, TypeVar
 
 import sqlalchemy as sa
@@ -129,49 +126,22 @@ def _unusable_url(url: str, reason: str) -> StoreError:
     )
 
 
-class CopyConnection(sqlite3.Connection):
-    """An SQLite connection to a temporary copy of a file; the copy is deleted with it."""
-
-
 def _connect_sqlite(
     dialect: Any, record: Any, arguments: Sequence[Any], options: Mapping[str, Any]
 ) -> Any:
     """Return a new SQLite connection; it only reads if the file or its folder cannot be written.
 
     SQLAlchemy calls this with its dialect, its own record of the connection, which is not used, and
-    the arguments and options for `sqlite3.connect`; the first argument is the file. Such a file
-    without a `-wal` beside it is opened as immutable. If it has a `-wal`, but no `-shm` and SQLite
-    cannot create that, both files are copied to a temporary folder, which is deleted with the
-    connection, and the copy is opened for reading. A new file and a `file:` URI are opened in the
-    driver's own way. A damaged file raises nothing here, but when the connection is used. Raise
-    sqlite3.Error if the file cannot be opened, and OSError if it cannot be copied.
+    the arguments and options for `sqlite3.connect`; the first argument is the file. If it or its
+    folder cannot be written, and it has no `-wal` beside it, it is opened as immutable. Every other
+    file, and a `file:` URI, is opened in the driver's own way. A damaged file raises nothing here,
+    but when the connection is used. Raise sqlite3.Error if the file cannot be opened.
     """
-    name = str(arguments[0])
-    file = Path(name)
-    log_file = Path(f"{name}-wal")
-    shared = Path(f"{name}-shm")
-    if options.get("uri") or not file.is_file():
-        return dialect.connect(*arguments, **options)
-    if log_file.exists() or os.access(file, os.W_OK):
-        connection = dialect.connect(*arguments, **options)
-        try:
-            connection.execute("PRAGMA schema_version").fetchone()  # reads the first page alone
-        except sqlite3.Error as error:
-            if not _is_unwritable(error) or shared.exists():
-                return connection  # the error comes again when the connection is used
-            connection.close()
-        else:
-            return connection
-    if not log_file.exists():
+    file = Path(str(arguments[0]))
+    is_closed = file.is_file() and not Path(f"{file}-wal").exists()
+    if is_closed and not (os.access(file, os.W_OK) and os.access(file.parent, os.W_OK)):
         return dialect.connect(f"{file.absolute().as_uri()}?immutable=1", uri=True, **options)
-    folder = TemporaryDirectory(prefix="dengine-", ignore_cleanup_errors=True)
-    for source in (file, log_file):
-        shutil.copyfile(source, Path(folder.name) / source.name)
-    # For reading: what was written to a copy would be lost.
-    copied = f"{(Path(folder.name) / file.name).as_uri()}?mode=ro"
-    copy = dialect.connect(copied, uri=True, factory=CopyConnection, **options)
-    weakref.finalize(copy, folder.cleanup)
-    return copy
+    return dialect.connect(*arguments, **options)
 
 
 def _is_unwritable(error: Exception) -> bool:

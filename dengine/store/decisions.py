@@ -20,7 +20,6 @@ from .queries import (
     WITH_LABELS,
     n_decisions,
     past_query,
-    stretches_query,
 )
 from .records import CHUNK, StoredDecision, from_row, read_decision
 from .schema import CORRECTION, DECISION, LABEL, TRACE
@@ -292,7 +291,7 @@ class DecisionTable(CellTable):
             groups, min(first, default=None), max(latest, default=None), max(label, default=None)
         )
 
-    def stretches(self, n: int = 1, **by: Any) -> list[Stretch]:
+    def stretches(self, n: int = 1, seconds: float = 0.0, start: float = 0.0) -> list[Stretch]:
         """Count the cell's decisions in at most `n` stretches of equal length, oldest first.
 
         A stretch is a run of consecutive decisions, or a period of time. The newest stretch may be
@@ -302,16 +301,36 @@ class DecisionTable(CellTable):
         ----------
         n : int, default 1
             Number of stretches of decisions at most, 1 or more; without effect on periods of time.
-        **by
-            For periods of time: `seconds`, the length of a period, and `start`, a time in seconds
-            since 1970 at which a period begins (0.0 by default).
+        seconds : float, default 0.0
+            Length of a period of time; 0.0: the stretches are runs of decisions.
+        start : float, default 0.0
+            A time, in seconds since 1970, at which a period begins.
 
         Returns
         -------
         list of Stretch
+            Sorted by their newest decision.
         """
-        length = max(1, -(-self.newest_number() // n))
-        rows = self._read(stretches_query(self._database.cell_id, length, **by))
+        if seconds:
+            stretch: sa.ColumnElement[Any] = sa.func.floor((DECISION.c.time - start) / seconds)
+        else:
+            length = max(1, -(-self.newest_number() // n))
+            stretch = (DECISION.c.number - 1) // length
+        verified, accepted, rejected = (DECISION.c.action == action.value for action in Action)
+        novel, outside = (
+            DECISION.c.reason == reason.value for reason in (Reason.NOVEL, Reason.OUTSIDE)
+        )
+        false_accepted = accepted & (SUCCESS == 0)
+        # In the order of the fields of `Stretch`.
+        conditions = (verified, novel, accepted, false_accepted, rejected & ~outside, outside)
+        counts = [sa.func.sum(sa.case((condition, 1), else_=0)) for condition in conditions]
+        rows = self._read(
+            sa.select(sa.func.count(), sa.func.max(DECISION.c.time), *counts)
+            .select_from(WITH_LABELS)
+            .where(self._own(DECISION))
+            .group_by(stretch)
+            .order_by(sa.func.max(DECISION.c.number))
+        )
         return [Stretch(*row) for row in rows]
 
     def counts(self, tally: Tally | None = None) -> dict[str, Any]:

@@ -290,9 +290,9 @@ class JournalledStore(Outbox):
             raise
 
     def load_ids(self) -> None:
-        """Read the ids of all decisions from the database into a Bloom filter in memory.
+        """Read the ids of all decisions from the database, and keep their hashes in memory.
 
-        By the filter most new ids are recognized without the database. It takes about a second for
+        By these a new id is recognized without the database. It takes about a second for
         a million ids, without a time limit; other calls to this outbox may go on meanwhile. Once
         all are loaded, another call does nothing. Raise StoreError if the database cannot be read.
         """

@@ -3,14 +3,14 @@ and as outcomes for a decision rule. `SqlStore` has one.
 """
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
 import sqlalchemy as sa
 
 from ..errors import StoreError, listed
-from ..records import Reason, Source, TraceArray
+from ..records import Reason, Source
 from .cell_table import CellTable
 from .connections import Database
 from .decisions import DecisionTable
@@ -18,11 +18,11 @@ from .events import EventTable
 from .ledger import is_intact
 from .queries import (
     LABEL_OF_DECISION,
+    TRACE_OF_LABEL,
     TRAINS,
     Scope,
     audit_columns,
     corrected_label,
-    training_query,
 )
 from .records import (
     CHUNK,
@@ -99,18 +99,45 @@ class LabelTable(CellTable):
             is not noticed here. If the database fails.
         """
         scope = Scope(self._database.cell_id) if cell_only else self._scope
-        query = training_query(scope, corrected_to).order_by(LABEL.c.seq.desc()).limit(limit)
-        query = query if first <= 1 else query.where(LABEL.c.seq >= int(first))
-        query = query if last is None else query.where(LABEL.c.seq <= last)
+        label = corrected_label(corrected_to)
+        columns = (LABEL.c.seq, label.label("success"), LABEL.c.content_hash)
+        query = (
+            sa.select(*TRACE.c, *columns, LABEL.c.decision_id.label("labelled_id"))
+            .select_from(LABEL.outerjoin(TRACE, TRACE_OF_LABEL))
+            .where(scope.shared(LABEL.c.cell_id), TRAINS, label != FORGOTTEN)
+            .where(LABEL.c.seq >= int(first), *[] if last is None else [LABEL.c.seq <= last])
+            .order_by(LABEL.c.seq.desc())
+            .limit(limit)
+        )
+        kept = []
+        traces = []
+        damaged = []
         with self._database.reading() as connection:
-            rows = self._read_newest(connection, query, limit, last)[::-1]
-            labelled, damaged = self._with_traces(connection, rows, scope)
-        self._record_left_out(damaged, "trace")
-        return labelled
+            for row in self._read_newest(connection, query, limit, last):
+                if row.success not in (0, 1):
+                    raise StoreError(
+                        "Expected labels that are True or False, found another: the store is "
+                        "damaged; restore a copy."
+                    )
+                if is_intact(TRACE, row):
+                    kept.append((row.seq, row.success, row.content_hash))
+                    traces.append(unpack(row.data).reshape(row.channels, row.samples))
+                else:
+                    damaged.append(row.labelled_id)
+        self._record_left_out(damaged[::-1], "trace")
+        shapes = sorted({trace.shape for trace in traces})
+        if len(shapes) > 1:
+            raise StoreError(
+                f"Expected one shape in a cell's store, found {shapes}; give each kind its own "
+                "cell_id."
+            )
+        seq, labels, hashes = np.array(kept[::-1], dtype=np.int64).reshape(-1, 3).T.copy()
+        stacked = np.stack(traces[::-1]) if traces else np.zeros((0, 0, 0), np.float32)
+        return LabelledTraces(seq, stacked, labels.astype(np.int8), hashes)
 
     def _read_newest(
         self, connection: sa.Connection, query: sa.Select[Any], limit: int | None, last: int | None
-    ) -> Sequence[Any]:
+    ) -> Iterable[Any]:
         """Run a query for the newest `limit` labels up to number `last`; return rows, newest first.
 
         `query` must have this limit (None: no limit), order and condition already. In a product it
@@ -120,56 +147,12 @@ class LabelTable(CellTable):
         """
         if self._scope.product is not None and limit is not None:
             newest = self._scope.newest(connection, LABEL.c.seq)
-            newest = newest if last is None else min(newest, last)
+            newest = min(newest, last or newest)
             rows = connection.execute(query.where(LABEL.c.seq > newest - 2 * limit)).all()
             if len(rows) == limit or newest <= 2 * limit:
                 return rows
-        return connection.execute(query).all()  # here more than half are quarantined or forgotten
-
-    def _with_traces(
-        self, connection: sa.Connection, rows: Sequence[Any], scope: Scope
-    ) -> tuple[LabelledTraces, list[str]]:
-        """Read the traces of label rows, which are sorted by number, oldest first.
-
-        `scope` is the cell, or the cell with its product, whose labels the rows are. Return the
-        labelled traces in this order, and the ids of decisions whose traces are missing or not as
-        they were stored; these are left out. Raise StoreError if traces have different shapes, or a
-        label is not 0 or 1.
-        """
-        labels = {row.seq: row for row in rows}  # the forgotten are not among them
-        traces: dict[int, TraceArray] = {}
-        is_of_label = (TRACE.c.cell_id == LABEL.c.cell_id) & (
-            TRACE.c.decision_id == LABEL.c.decision_id
-        )
-        query = (
-            sa.select(*TRACE.c, LABEL.c.seq)
-            .select_from(LABEL.join(TRACE, is_of_label))
-            .where(scope.shared(LABEL.c.cell_id), TRAINS)
-        )
-        first, last = (rows[0].seq, rows[-1].seq) if rows else (1, 0)
-        query = query.where(LABEL.c.seq.between(first, last)).order_by(LABEL.c.seq)
-        for row in connection.execute(query.execution_options(yield_per=CHUNK)):
-            if row.seq in labels and is_intact(TRACE, row):
-                traces[row.seq] = unpack(row.data).reshape(row.channels, row.samples)
-        shapes = sorted({trace.shape for trace in traces.values()})
-        if len(shapes) > 1:
-            raise StoreError(
-                f"Expected one shape in a cell's store, found {shapes}; give each kind its own "
-                "cell_id."
-            )
-        if not all(row.success in (0, 1) for row in rows):
-            raise StoreError(
-                "Expected labels that are True or False, found another: the store is damaged; "
-                "restore a copy."
-            )
-        kept = [labels[seq] for seq in traces]
-        labelled = LabelledTraces(
-            seq=np.array([row.seq for row in kept], dtype=np.int64),
-            traces=np.stack([*traces.values()]) if traces else np.zeros((0, 0, 0), np.float32),
-            labels=np.array([row.success for row in kept], dtype=np.int8),
-            hashes=np.array([row.content_hash for row in kept], dtype=np.int64),
-        )
-        return labelled, [row.decision_id for row in rows if row.seq not in traces]
+        # In a product: here more than half are quarantined or forgotten.
+        return connection.execute(query.execution_options(yield_per=CHUNK))
 
     def past(self, after: int, upto: int | None = None) -> list[PastLabel]:
         """Return this cell's labels as they were recorded, oldest first.

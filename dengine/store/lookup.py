@@ -1,17 +1,13 @@
 """`DecisionIndex`: the decisions that an engine can look up without its database. It holds the
 newest ones in memory, knows where in the journal the others are that the database lacks, and
-recognizes a new id by a `BloomFilter` over all ids. `JournalledStore` has one.
+recognizes a new id by the hashes of all ids. `JournalledStore` has one.
 """
 
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Iterable, Sequence
-from hashlib import blake2b
+from collections.abc import Sequence
 from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
 
 from .journal import Journal, Record, decode_record
 from .recording import Entry
@@ -20,53 +16,11 @@ from .records import NewLabel, StoredDecision
 N_RECENT = 1_000  # newest decisions kept in memory
 
 
-class BloomFilter:
-    """A set of decision ids in 2 MB, however many: it may report an id that was never added.
-
-    It never misses an id that was added. At a million ids, one new id in 500 is reported.
-
-    Parameters
-    ----------
-    ids : iterable of str
-        The first ids.
-
-    References
-    ----------
-    Bloom (1970), CACM 13(7).
-    """
-
-    def __init__(self, ids: Iterable[str] = ()) -> None:
-        self._bytes = np.zeros(2**21, dtype=np.uint8)
-        self.add(*ids)
-
-    def add(self, *ids: str) -> None:
-        """Add ids."""
-        byte, bit = self._bit_positions(ids)
-        np.bitwise_or.at(self._bytes, byte, bit)
-
-    def may_contain(self, decision_id: str) -> bool:
-        """Return False if the id was never added, True if it was or (rarely) if it was not."""
-        byte, bit = self._bit_positions([decision_id])
-        return bool((self._bytes[byte] & bit).all())
-
-    def _bit_positions(self, ids: Iterable[str]) -> tuple[NDArray[Any], NDArray[Any]]:
-        """Return the four bits of the filter that belong to each id.
-
-        The first array has the index of the byte in which a bit is, the second a byte in which only
-        this bit is set. Both arrays have four entries per id; the second has dtype uint8.
-        """
-        digests = bytearray()
-        for id_ in ids:
-            digests += blake2b(id_.encode("utf-8", "surrogatepass"), digest_size=16).digest()
-        positions = np.frombuffer(digests, dtype="<u4") % (8 * len(self._bytes))
-        return positions >> 3, np.left_shift(1, positions & 7, dtype=np.uint8, casting="unsafe")
-
-
 class DecisionIndex:
     """Finds decisions and labels by id in memory and in the journal, without the database.
 
-    It holds the newest decisions, every record that is not drained, and a Bloom filter of all ids,
-    which tells ids that are certainly new.
+    It holds the newest decisions, every record that is not drained, and the hashes of all ids,
+    which tell ids that are certainly new. A million hashes take about 70 MB of memory.
 
     It has no lock: whoever shares it between threads holds one.
 
@@ -89,7 +43,7 @@ class DecisionIndex:
         # Not drained, by decision: the newest record of the decision, and of its label.
         self._decisions: dict[str, Entry] = {}
         self._labels: dict[str, tuple[NewLabel, Entry]] = {}
-        self._ids = BloomFilter()
+        self._hashes: set[int] = set()  # of all ids; they take less memory than the ids
         self.has_all_ids = False
 
     def add(self, record: Record, entry: Entry) -> None:
@@ -103,7 +57,7 @@ class DecisionIndex:
             id_ = record.decision.id
             self.recent[id_] = record
             self._decisions[id_] = entry
-            self._ids.add(id_)
+            self._hashes.add(hash(id_))
             if len(self.recent) > N_RECENT:
                 self.recent.popitem(last=False)
         elif isinstance(record, NewLabel):
@@ -175,8 +129,8 @@ class DecisionIndex:
 
         Until all ids are loaded, False for every id.
         """
-        return self.has_all_ids and not self._ids.may_contain(decision_id)
+        return self.has_all_ids and hash(decision_id) not in self._hashes
 
     def add_ids(self, ids: Sequence[str]) -> None:
         """Add ids of decisions that the database has."""
-        self._ids.add(*ids)
+        self._hashes.update(map(hash, ids))
