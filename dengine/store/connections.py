@@ -95,12 +95,14 @@ def make_engine(url: str | None) -> sa.Engine:
             return sa.create_engine(parsed, pool_pre_ping=True, connect_args=TIMEOUTS)
         return _with_sqlite_events(sa.create_engine(parsed, connect_args={"timeout": BUSY_SECONDS}))
     except (sa.exc.ArgumentError, ImportError, ValueError) as error:
+        reason = f"{error}"
         if isinstance(error, ValueError) and "@" in url:
             # The error may quote half of a password, which it took for a port.
-            raise _unusable_url(
-                url, "it cannot be read; write @, : and / in a password as %40, %3A and %2F"
-            ) from None
-        raise _unusable_url(url, f"{error}") from error
+            reason = "it cannot be read; write @, : and / in a password as %40, %3A and %2F"
+        raise StoreError(
+            f"Expected a file or a database URL that can be used here, got "
+            f"{url.split('@')[-1]!r}: {reason}. For PostgreSQL: pip install 'dengine[postgres]'."
+        ) from None  # the error may have the password
 
 
 def _with_sqlite_events(engine: sa.Engine) -> sa.Engine:
@@ -113,17 +115,6 @@ def _with_sqlite_events(engine: sa.Engine) -> sa.Engine:
     sa.event.listen(engine, "connect", _set_pragmas)
     sa.event.listen(engine, "begin", _begin_transaction)
     return engine
-
-
-def _unusable_url(url: str, reason: str) -> StoreError:
-    """Return the StoreError for a URL that cannot be used, with the reason.
-
-    The message quotes only the part of the URL behind the last @, so that no password is in it.
-    """
-    return StoreError(
-        f"Expected a file or a database URL that can be used here, got {url.split('@')[-1]!r}: "
-        f"{reason}. For PostgreSQL: pip install 'dengine[postgres]'."
-    )
 
 
 def _connect_sqlite(
@@ -144,13 +135,6 @@ def _connect_sqlite(
     return dialect.connect(*arguments, **options)
 
 
-def _is_unwritable(error: Exception) -> bool:
-    """Return whether an SQLite error says that a file is read-only, or cannot be opened."""
-    # An extended code has more in its higher bits
-    code = getattr(error, "sqlite_errorcode", 0) & 0xFF
-    return code in (sqlite3.SQLITE_READONLY, sqlite3.SQLITE_CANTOPEN)
-
-
 def _set_pragmas(connection: Any, record: Any) -> None:
     """Set a new SQLite connection to synchronous=FULL, so that a commit survives a power failure.
 
@@ -169,8 +153,9 @@ def _set_pragmas(connection: Any, record: Any) -> None:
             connection.execute("PRAGMA page_size = 16384")
             connection.execute("PRAGMA journal_mode = WAL")
     except sqlite3.OperationalError as error:
-        if not _is_unwritable(error):  # such a file keeps its mode, and is read
-            raise
+        primary_code = error.sqlite_errorcode & 0xFF  # without the bits of an extended code
+        if primary_code not in (sqlite3.SQLITE_READONLY, sqlite3.SQLITE_CANTOPEN):
+            raise  # else the file keeps its mode, and is read
     except UnicodeDecodeError as error:  # SQLite's error quotes a damaged table name
         raise sqlite3.DatabaseError("the database is malformed") from error
     # A returned commit survives a power failure; with NORMAL it would not.
@@ -667,20 +652,16 @@ class Database:
         list of int
             The numbers, in the order of the rows; empty without rows.
         """
-        numbers: list[int] = []
-        if rows:
-            number = self.scope.next_number(connection, column)
-            for row in rows:
-                number = max(number, row.get(column.name, 0))
-                numbers.append(number)
-                number += 1
-            common = {"cell_id": self.cell_id}
-            numbered = [
-                {**row, **common, column.name: number}
-                for row, number in zip(rows, numbers, strict=True)
-            ]
-            connection.execute(sa.insert(column.table), numbered)
-        return numbers
+        if not rows:
+            return []
+        number = self.scope.next_number(connection, column)
+        numbered = []
+        for row in rows:
+            number = max(number, row.get(column.name, 0))
+            numbered.append({**row, "cell_id": self.cell_id, column.name: number})
+            number += 1
+        connection.execute(sa.insert(column.table), numbered)
+        return [row[column.name] for row in numbered]
 
     def rows_by_id(
         self, connection: sa.Connection, query: sa.Select[Any], ids: Sequence[str]

@@ -257,7 +257,7 @@ class DecisionTable(CellTable):
         -------
         Tally
             The groups, in no order, with the number of decisions in each; the smallest and the
-            largest time of these decisions, and the largest of their labels, None without any.
+            largest time of these decisions, None without any.
         """
         newest = n_decisions(self._database.cell_id)
         aged = (sa.false() if within is None else newest - DECISION.c.number >= within).label(
@@ -272,9 +272,8 @@ class DecisionTable(CellTable):
             sa.func.count().label("n"),
         )
         times = (
-            sa.func.min(DECISION.c.time),
-            sa.func.max(DECISION.c.time),
-            sa.func.max(LABEL.c.time),
+            sa.func.min(DECISION.c.time).label("first"),
+            sa.func.max(DECISION.c.time).label("last"),
         )
         query = (
             sa.select(*group, *times)
@@ -283,12 +282,10 @@ class DecisionTable(CellTable):
             .where(self._own(DECISION), DECISION.c.model_version >= since_version)
         )
         rows = self._read(query if last is None else query.where(DECISION.c.number > newest - last))
-        first, latest, label = (
-            [row[i] for row in rows if row[i] is not None] for i in (-3, -2, -1)
-        )
-        groups = tuple(from_row(DecisionGroup, row._mapping) for row in rows)
         return Tally(
-            groups, min(first, default=None), max(latest, default=None), max(label, default=None)
+            groups=tuple(from_row(DecisionGroup, row._mapping) for row in rows),
+            first=min((row.first for row in rows), default=None),
+            last=max((row.last for row in rows), default=None),
         )
 
     def stretches(self, n: int = 1, seconds: float = 0.0, start: float = 0.0) -> list[Stretch]:

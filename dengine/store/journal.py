@@ -41,11 +41,11 @@ from ..errors import StoreError, instead
 from ..records import Decision
 from .owned_file import OwnedFile, open_plain, sync
 from .records import (
-    OF_DECISION,
     EntryName,
     Event,
     NewLabel,
     StoredDecision,
+    decision_row,
     from_row,
     pack,
     to_row,
@@ -79,7 +79,7 @@ def encode_record(record: Record) -> bytes:
     length, checksum and digest that stand before each record in a journal are not included.
     """
     if isinstance(record, StoredDecision):
-        row = to_row(record.decision) | to_row(record, *OF_DECISION) | {"shape": record.trace.shape}
+        row = decision_row(record) | {"shape": record.trace.shape}
         samples = pack(record.trace)
     else:
         row = to_row(record)
@@ -93,11 +93,10 @@ def decode_record(blob: bytes) -> Record:
 
     A changed number or sample is not noticed here; `Journal.read` checks for that.
     """
-    errors = (struct.error, ValueError, KeyError, TypeError, AttributeError)
     with instead(
         StoreError,
         "Expected a record of a journal, got what cannot be read",
-        *errors,
+        *(struct.error, *DAMAGES),
         do="open the store with the dengine that wrote it",
     ):
         (length,) = LENGTH.unpack_from(blob)

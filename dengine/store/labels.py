@@ -275,13 +275,10 @@ class LabelTable(CellTable):
         -------
         int
         """
-        return int(
-            self._read(
-                sa.select(sa.func.coalesce(sa.func.sum(LABEL.c.silent), 0)).where(
-                    self._own(LABEL), TRAINS, LABEL.c.model_version >= since_version
-                )
-            )[0][0]
+        query = sa.select(sa.func.sum(LABEL.c.silent)).where(
+            self._own(LABEL), TRAINS, LABEL.c.model_version >= since_version
         )
+        return int(self._read(query)[0][0] or 0)
 
     def _record_left_out(self, damaged: Sequence[str], part: str) -> None:
         """Write an event to the store that says that some traces or labels were left out.

@@ -20,11 +20,13 @@ from .schema import (
     LABEL,
     PRODUCT,
     PRODUCT_KEY,
-    RESERVED,
     SETTING,
     TRACE,
     VERSION,
+    insert_settings,
     lock,
+    read_setting,
+    read_settings,
 )
 
 
@@ -154,9 +156,7 @@ def join_product(connection: sa.Connection, cell_id: str, product: str | None) -
         If the cell has another product, if the name is empty or not printable, and if the cell has
         settings or labels already without a product: its labels were numbered without the others.
     """
-    is_own = SETTING.c.cell_id == cell_id
-    query = sa.select(SETTING.c.value).where(is_own, SETTING.c.key == PRODUCT_KEY)
-    stored: str | None = connection.execute(query).scalar()
+    stored = read_setting(connection, cell_id, PRODUCT_KEY)
     if product is None or stored == product:
         return stored
     expect(
@@ -168,23 +168,16 @@ def join_product(connection: sa.Connection, cell_id: str, product: str | None) -
     )
     is_name = bool(product.strip()) and product.isprintable()
     expect(is_name, "a product's name of printable characters", product, error=StoreError)
-    settings = connection.execute(
-        sa.select(SETTING.c.key).where(is_own, SETTING.c.key.not_in(RESERVED))
-    ).first()
-    label = connection.execute(
-        sa.select(LABEL.c.seq).where(LABEL.c.cell_id == cell_id).limit(1)
-    ).first()
+    has_labels = Scope(cell_id).newest(connection, LABEL.c.seq) > 0
     expect(
-        settings is None and label is None,
+        not (has_labels or read_settings(connection, cell_id)),
         f"a new cell for product {product!r}",
         cell_id,
         "it has worked without a product: name a new cell, and bring its labels over by an import",
         StoreError,
     )
     lock(connection, PRODUCT, product)
-    connection.execute(
-        sa.insert(SETTING), {"cell_id": cell_id, "key": PRODUCT_KEY, "value": product}
-    )
+    insert_settings(connection, cell_id, {PRODUCT_KEY: product})
     return product
 
 

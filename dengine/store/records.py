@@ -321,17 +321,17 @@ def overdue_outcomes(decision: Decision) -> list[OutcomeRecord]:
     `predicted` is VERIFY. So there are none, one or two, all with `seq` 0, not novel, with `silent`
     0 and the inclusion probability of the decision.
     """
-    accepts = int(decision.predicted is Action.ACCEPT)
-    rejects = 2 * int(decision.predicted is Action.REJECT)
+    probability = decision.inclusion_probability
     outcomes = []
     if decision.lower > 0.0:
-        outcomes.append((decision.lower, 1.0, False, accepts))
+        accepts = int(decision.predicted is Action.ACCEPT)
+        outcomes.append(
+            OutcomeRecord(0, decision.lower, 1.0, False, False, 0, accepts, probability)
+        )
     if decision.upper < 1.0:
-        outcomes.append((0.0, decision.upper, True, rejects))
-    return [
-        OutcomeRecord(0, lower, upper, good, False, 0, predicted, decision.inclusion_probability)
-        for lower, upper, good, predicted in outcomes
-    ]
+        rejects = 2 * int(decision.predicted is Action.REJECT)
+        outcomes.append(OutcomeRecord(0, 0.0, decision.upper, True, False, 0, rejects, probability))
+    return outcomes
 
 
 @dataclass(frozen=True, slots=True)
@@ -570,15 +570,13 @@ def from_row(record_type: Callable[..., T], row: Mapping[str, Any], **given: Any
         If the row lacks a field, or a value cannot be converted to the type of its field. Fields of
         type str, int and float take any value, unchecked.
     """
-    wanted = {
-        name: type_
-        for name, (type_, _) in columns(record_type).items()
-        if name in row and name not in given
-    }
     try:
-        return record_type(
-            **{name: _from_column(row[name], type_) for name, type_ in wanted.items()}, **given
-        )
+        values = {
+            name: _from_column(row[name], type_)
+            for name, (type_, _) in columns(record_type).items()
+            if name in row and name not in given
+        }
+        return record_type(**values, **given)
     except (ValueError, TypeError) as error:
         name = getattr(record_type, "__name__", record_type)
         raise StoreError(

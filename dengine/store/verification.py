@@ -11,9 +11,9 @@ kept elsewhere is passed as `expect`; and that somebody with the right to write 
 history anew, which a keyed ledger shows, or again a digest from elsewhere.
 """
 
-import json
 import re
 import struct
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
@@ -33,6 +33,7 @@ from .ledger import (
     entry_digest,
     find_settings_faults,
     ledger_key,
+    parse_object,
     row_sum,
     rows_digest,
     state_sum,
@@ -49,6 +50,7 @@ from .schema import (
     SETTING,
     TRACE,
     VERSION,
+    read_setting,
 )
 
 # The column of each chained table that, with the cell, identifies a row.
@@ -433,8 +435,7 @@ class CellCheck:
         """
         for key, problem in find_settings_faults(self.connection, self.cell_id).items():
             yield self._fault(SETTING.name, key, problem)
-        is_schema = (SETTING.c.cell_id == self.cell_id) & (SETTING.c.key == SCHEMA_KEY)
-        if self.connection.execute(sa.select(SETTING.c.key).where(is_schema)).first() is None:
+        if read_setting(self.connection, self.cell_id, SCHEMA_KEY) is None:
             yield self._fault(
                 SETTING.name, SCHEMA_KEY, "is missing: no engine has opened this cell"
             )
@@ -469,17 +470,12 @@ def _entry_fault(added: Any, sums: Mapping[str, list[bytes]]) -> str:
     were changed. `added` is the entry's column of that name, the numbers in JSON; if it is damaged,
     all are 0. `sums` has the sums of the rows that are there, by table.
     """
-    counts: dict[str, int] = {}
-    with suppress(TypeError, ValueError):
-        counts = dict(json.loads(added))
-    present = {table: len(rows) for table, rows in sums.items()}
-    different = [
-        name
-        for name in sorted(counts.keys() | present.keys())
-        if counts.get(name, 0) != present.get(name, 0)
-    ]
+    counts = Counter[str](parse_object(added))
+    present = Counter({table: len(rows) for table, rows in sums.items()})
     missing = "; ".join(
-        f"{counts.get(name, 0)} of {name}, {present.get(name, 0)} found" for name in different
+        f"{counts[name]} of {name}, {present[name]} found"
+        for name in sorted({*counts, *present})
+        if counts[name] != present[name]
     )
     return f"chained {missing}" if missing else "was changed, or rows that it chains were"
 

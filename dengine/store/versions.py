@@ -116,12 +116,10 @@ class VersionTable(CellTable):
         does not keep are deleted. The product is then locked until the transaction ends.
         """
         number: int = row["version"]
-        if (
-            self._scope.product is not None and row["accepted"]
-        ):  # a peer's may have been stored before
-            lock(connection, PRODUCT, self._scope.product)
-            number = max(number, self._scope.newest_version(connection) + 1)
         if row["accepted"]:
+            if self._scope.product is not None:  # a peer's may have been stored before
+                lock(connection, PRODUCT, self._scope.product)
+                number = max(number, self._scope.newest_version(connection) + 1)
             with_state = connection.execute(
                 self._accepted_query().where(VERSION.c.state.is_not(None))
             ).all()

@@ -5,19 +5,24 @@ explanations are computed from them.
 """
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import SettingError, expect, shortened
+from ..errors import expect
 from ..records import Action, Reason, Source
 from .records import Outcomes
 
-ENUMERATIONS = {"action": Action, "predicted": Action, "reason": Reason}
 LABELS: dict[str, bool | None] = {"good": True, "bad": False, "none": None}
+OPTIONS: dict[str, Collection[str]] = {
+    "action": list(Action),
+    "predicted": list(Action),
+    "reason": list(Reason),
+    "label": list(LABELS),
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,30 +48,20 @@ class HistoryFilter:
         For a value that a field cannot have.
     """
 
-    action: Action | None = None
-    reason: Reason | None = None
+    action: str | None = None
+    reason: str | None = None
     label: str | None = None
     since: float | None = None
     until: float | None = None
-    predicted: Action | None = None
+    predicted: str | None = None
     part: str | None = None
 
     def __post_init__(self) -> None:
-        """Convert words to enumerations; raise SettingError for a value that is not valid."""
-        for name, enumeration in ENUMERATIONS.items():
-            try:
-                if (value := getattr(self, name)) is not None:
-                    object.__setattr__(self, name, enumeration(value))
-            except ValueError:
-                options = ", ".join(enumeration)
-                raise SettingError(
-                    f"Expected {name} to be one of {options}, got {shortened(value)}."
-                ) from None
-        expect(
-            self.label is None or self.label in LABELS,
-            f"label to be one of {', '.join(LABELS)}",
-            self.label,
-        )
+        """Raise SettingError for a value that is not valid."""
+        for name, options in OPTIONS.items():
+            value = getattr(self, name)
+            is_valid = value is None or value in options
+            expect(is_valid, f"{name} to be one of {', '.join(options)}", value)
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,14 +149,11 @@ class Tally:
     groups : tuple of DecisionGroup
     first, last : float or None
         Times of the oldest and the newest decision, in seconds since 1970; None without decisions.
-    last_label : float or None
-        When the newest label came; None without labels.
     """
 
     groups: tuple[DecisionGroup, ...]
     first: float | None
     last: float | None
-    last_label: float | None = None
 
     def count(self, is_counted: Callable[[DecisionGroup], bool] = lambda group: True) -> int:
         """Return the number of decisions in the groups for which `is_counted` is true.
