@@ -230,7 +230,7 @@ def reading(url: str) -> Iterator[sa.Connection]:
         TypeError, OverflowError or OSError that the block raises, unless it is dengine's own.
     """
     engine = make_engine(url)
-    name = engine.url.render_as_string(hide_password=True)
+    name = engine.url.render_as_string()
     sqlite = engine.dialect.name == "sqlite"
     options = {} if sqlite else {"isolation_level": "REPEATABLE READ", "postgresql_readonly": True}
     try:
@@ -328,7 +328,7 @@ class Database:
         self._engine = self._writer = make_engine(url)
         chain_writes(self._engine)
         self.url = self._engine.url  # its password included
-        self.name = self.url.render_as_string(hide_password=True)
+        self.name = self.url.render_as_string()
         self.scope = self._open(product)
         # The file with what it was when it was opened. None: in memory, or a server.
         self._file: tuple[Path, os.stat_result] | None = None

@@ -159,9 +159,6 @@ class Journal:
     entries : list of (int, str)
         Number and digest of the ledger entries that header and head named at the opening: two, or
         fewer if one of them is missing, new or damaged.
-    dropped : int
-        Bytes of an unfinished record at the end, left by a killed process and cut off. That record
-        was never acknowledged.
     loss : str
         Which acknowledged records are missing or not as they were written, in words; "" if none is.
         The others are read all the same.
@@ -177,7 +174,6 @@ class Journal:
         self.path = path
         self.drained_to = HEADER
         self.end = HEADER
-        self.dropped = 0
         self.loss = ""
         self.head = read_head(path)
         self.entries: list[EntryName] = []
@@ -416,8 +412,8 @@ class Journal:
         """Read header, head and all records that the store lacks; set the journal's attributes.
 
         With a damaged header the store counts as lacking every record. Records that are damaged or
-        missing are described in `loss`, and the bytes of an unfinished record counted in `dropped`;
-        they are not raised. Nothing is written. Raise StoreError if the file is no journal, and
+        missing are described in `loss`, and not raised. An unfinished record at the end is left
+        out. Nothing is written. Raise StoreError if the file is no journal, and
         OSError if it cannot be read. An empty file is a journal without records.
         """
         head = self.head
@@ -447,9 +443,7 @@ class Journal:
             damaged += offset > begin or not follows
             digests.append(digest)
             begin = end
-        rest = self._file.read(self.end - begin, begin)
-        self.end = begin
-        self.dropped = len(rest.rstrip(b"\0"))
+        self.end = begin  # behind it is at most a record that was never acknowledged
         n_drained = fields["n_drained"]
         n_known = n_drained + len(set(digests))  # a record may be there twice
         is_newest_missing = n_known < head.n_synced or bytes.fromhex(head.digest) not in digests

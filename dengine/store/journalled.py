@@ -115,10 +115,9 @@ class JournalledStore(Outbox):
         """Copy to the database what an earlier process left in the journal, and clear the journal.
 
         If records are damaged or missing in the journal, an event DATA_LOST is stored, which is an
-        alarm until a person acknowledges it. Otherwise, if a killed process left an unfinished
-        record, which was cut off, an event that is no alarm says so. Either is logged as an error.
-        Raise StoreError if the database fails, or another release wrote a record, and OSError if
-        the journal cannot be read; the records that were not copied then stay in the journal.
+        alarm until a person acknowledges it, and an error is logged. Raise StoreError if the
+        database fails, or another release wrote a record, and OSError if the journal cannot be
+        read; the records that were not copied then stay in the journal.
         """
         newest = self.store.decisions.select(HistoryFilter(), limit=1)
         since = "".join(
@@ -132,12 +131,6 @@ class JournalledStore(Outbox):
             self._drainer.drain_chunk()
         if self._journal.loss:
             self._drainer.report(DATA_LOST, self._journal.loss + since)
-        elif self._journal.dropped:
-            self._drainer.report(
-                "journal",
-                f"{self._journal.dropped} bytes at its end were dropped: a process was killed as "
-                "it wrote them",
-            )
         self._journal.clear()
 
     def _begin_check(self) -> None:

@@ -75,13 +75,10 @@ def check_peer_settings(
         return
     peer_values = _embedding_settings(peer_settings)
     values = _embedding_settings(settings)
+    different = [key for key in values if values[key] != peer_values[key]]
     # The first trace of any cell sets the product's trace spec.
-    is_open = None in (peer_values["trace"], values["trace"])
-    different = [
-        key
-        for key, value in peer_values.items()
-        if value != values[key] and not (is_open and key == "trace")
-    ]
+    if None in (values["trace"], peer_values["trace"]) and "trace" in different:
+        different.remove("trace")
     if different:
         expected = ", ".join(f"{key} {peer_values[key]}" for key in different)
         actual = ", ".join(f"{key} {values[key]}" for key in different)

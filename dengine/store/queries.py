@@ -231,11 +231,13 @@ SUCCESS: sa.ColumnElement[int | None] = sa.func.nullif(corrected_label(), FORGOT
 
 # Where a label comes from, after corrections: an accepted part that silence confirmed, and that is
 # known to be bad, is one of a stop, which came late.
-_CONFIRMED: sa.ColumnElement[str] = sa.literal_column("'confirmed'")
-_STOP: sa.ColumnElement[str] = sa.literal_column("'stop'")
-_BAD: sa.ColumnElement[int] = sa.literal_column("0")
 SOURCE: sa.ColumnElement[str | None] = sa.case(
-    ((LABEL.c.source == _CONFIRMED) & (corrected_label() == _BAD), _STOP), else_=LABEL.c.source
+    (
+        (LABEL.c.source == sa.literal_column("'confirmed'"))
+        & (corrected_label() == sa.literal_column("0")),
+        sa.literal_column("'stop'"),
+    ),
+    else_=LABEL.c.source,
 )
 
 

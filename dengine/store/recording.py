@@ -11,6 +11,7 @@ import time
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import chain
 
 from ..errors import NotTakenError, log
 from .journal import Journal, LostJournalError, Record, encode_record
@@ -125,10 +126,8 @@ class Recorder:
         None if it lacks none. For a record that an earlier process left, it is the time of `adopt`.
         Hold `changed` meanwhile.
         """
-        for entries in (self.synced, self.unwritten):
-            if entries:
-                return entries[0].time
-        return None
+        oldest = next(chain(self.synced, self.unwritten), None)
+        return None if oldest is None else oldest.time
 
     def record(self, record: Record) -> Entry:
         """Add a record in memory, and wake the thread that writes it to the journal.
