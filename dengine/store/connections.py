@@ -63,8 +63,8 @@ def make_engine(url: str | None) -> sa.Engine:
     ------
     StoreError
         For any other database, for a URL that cannot be read, has a NUL or is not UTF-8, for an
-        SQLite URL in memory, and if the driver of PostgreSQL is not installed. The message has no
-        password.
+        SQLite URL in memory or with a `file:` URI, and if the driver of PostgreSQL is not
+        installed. The message has no password.
     """
     if url is None:
         options = {"poolclass": sa.pool.StaticPool, "connect_args": {"check_same_thread": False}}
@@ -83,9 +83,10 @@ def make_engine(url: str | None) -> sa.Engine:
         if parsed.drivername in ("postgres", "postgresql"):
             parsed = parsed.set(drivername="postgresql+psycopg")
         backend = parsed.get_backend_name()
-        in_file = backend == "sqlite" and parsed.database not in (None, "", ":memory:")
+        # A name `file:` is a URI of SQLite's own, which may mean anything.
+        is_file = not (parsed.database or ":memory:").startswith((":memory:", "file:"))
         expect(
-            backend == "postgresql" or in_file,
+            backend == "postgresql" or (backend == "sqlite" and is_file),
             "a file, an SQLite file URL or a PostgreSQL URL",
             parsed.render_as_string(),
             "for a store that forgets use store=None",
@@ -125,8 +126,8 @@ def _connect_sqlite(
     SQLAlchemy calls this with its dialect, its own record of the connection, which is not used, and
     the arguments and options for `sqlite3.connect`; the first argument is the file. If it or its
     folder cannot be written, and it has no `-wal` beside it, it is opened as immutable. Every other
-    file, and a `file:` URI, is opened in the driver's own way. A damaged file raises nothing here,
-    but when the connection is used. Raise sqlite3.Error if the file cannot be opened.
+    file is opened in the driver's own way. A damaged file raises nothing here, but when the
+    connection is used. Raise sqlite3.Error if the file cannot be opened.
     """
     file = Path(str(arguments[0]))
     is_closed = file.is_file() and not Path(f"{file}-wal").exists()
@@ -235,8 +236,7 @@ def reading(url: str) -> Iterator[sa.Connection]:
     options = {} if sqlite else {"isolation_level": "REPEATABLE READ", "postgresql_readonly": True}
     try:
         file = str(engine.url.database)
-        # A `file:` name is a URI of SQLite's own.
-        if sqlite and not (Path(file).is_file() or file.startswith("file:")):
+        if sqlite and not Path(file).is_file():
             raise StoreError(
                 f"Expected a store that an engine has used, found no file {file}; make a "
                 "DataEngine with it, or let `dengine train` or `dengine run` make one."
@@ -440,9 +440,7 @@ class Database:
         Raise StoreError if the database fails.
         """
         rows = self.read(
-            sa.select(LEDGER.c.digest).where(
-                LEDGER.c.cell_id == self.cell_id, LEDGER.c.number == number
-            )
+            sa.select(LEDGER.c.digest).where(self.own(LEDGER), LEDGER.c.number == number)
         )
         return [row.digest.hex() for row in rows] == [digest]
 
@@ -671,7 +669,7 @@ class Database:
         `query` selects from the table `decision`, its column `id` included, and is limited to this
         cell here. Return the rows by id; ids without a row are left out. Without ids no query runs.
         """
-        query = query.where(DECISION.c.cell_id == self.cell_id)
+        query = query.where(self.own(DECISION))
         return {
             row.id: row
             for part in chunks(ids)

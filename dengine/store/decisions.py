@@ -128,10 +128,9 @@ class DecisionTable(CellTable):
             conditions.append(DECISION.c.time < where.until)
         number = DECISION.c.number
         if start_after is not None:
-            other = DECISION.alias("other")
-            is_other = self._own(other) & (other.c.id == start_after)
-            limit_number = sa.select(other.c.number).where(is_other).scalar_subquery()
-            conditions.append(number < limit_number if newest else number > limit_number)
+            is_start = self._own(DECISION) & (DECISION.c.id == start_after)
+            start = sa.select(number).where(is_start).correlate(None).scalar_subquery()
+            conditions.append(number < start if newest else number > start)
         rows = self._read(
             past_query(self._database.cell_id)
             .where(*conditions)
@@ -320,9 +319,11 @@ class DecisionTable(CellTable):
         false_accepted = accepted & (SUCCESS == 0)
         # In the order of the fields of `Stretch`.
         conditions = (verified, novel, accepted, false_accepted, rejected & ~outside, outside)
-        counts = [sa.func.sum(sa.case((condition, 1), else_=0)) for condition in conditions]
+        counts: list[sa.ColumnElement[Any]] = [
+            sa.func.sum(sa.case((condition, 1), else_=0)) for condition in conditions
+        ]
         rows = self._read(
-            sa.select(sa.func.count(), sa.func.max(DECISION.c.time), *counts)
+            sa.select(*[sa.func.count(), sa.func.max(DECISION.c.time), *counts])
             .select_from(WITH_LABELS)
             .where(self._own(DECISION))
             .group_by(stretch)

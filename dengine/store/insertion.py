@@ -74,6 +74,8 @@ class RecordInsertion:
         event, unless it is a failure already. Return one pair (decision id, number) for each
         decision that has a label among the records, unless that becomes a dead letter: the number
         of its first label, whether that is new, was stored before, or is corrected by a late stop.
+        A new label keeps a positive number that is still free (`Database.insert`), and is
+        quarantined (kept out of training) if its decision is.
         """
         events = [record for record in records if isinstance(record, Event)]
         decisions = [record for record in records if isinstance(record, StoredDecision)]
@@ -86,7 +88,7 @@ class RecordInsertion:
         late_stops: dict[str, None] = {}
         for label in labels:
             id_ = label.decision_id
-            row = stored.get(id_)
+            row: Any = stored.get(id_)
             # The label that the decision has: of these records, or of the store.
             first = new.get(id_) if row is None or row.seq is None else row
             problem = _find_problem(label, row, first)
@@ -98,7 +100,13 @@ class RecordInsertion:
                 new[id_] = label
             elif _is_late_stop(label, first) and row.corrected != 0:  # else it is corrected already
                 late_stops[id_] = None
-        numbers = self._insert_labels(connection, new, stored)
+        rows = [
+            to_row(label) | {"quarantined": stored[label.decision_id].quarantined}
+            for label in new.values()
+        ]
+        numbers = {id_: row.seq for id_, row in stored.items()}
+        new_numbers = self._database.insert(connection, LABEL.c.seq, rows)
+        numbers |= dict(zip(new, new_numbers, strict=True))
         self._insert_events(connection, events, problems)
         for id_ in late_stops:
             self._correct_confirmation(connection, id_)
@@ -132,24 +140,6 @@ class RecordInsertion:
             cell = {"cell_id": self._database.cell_id}
             connection.execute(sa.insert(TRACE), [cell | trace_row(item) for item in new])
         return problems
-
-    def _insert_labels(
-        self, connection: sa.Connection, labels: dict[str, NewLabel], stored: dict[str, Any]
-    ) -> dict[str, int]:
-        """Insert new labels; return their numbers and those of the labels in `stored`, by decision.
-
-        `stored` has a row for each decision of the new labels (`CorrectionTable.stored_labels`),
-        with the number `seq` of the label that it has, or None, and `quarantined`. A label is
-        quarantined (kept out of training) if its decision is. Of a new label with a positive number
-        that is still free the number is kept (`Database.insert`). Nothing is committed.
-        """
-        rows = [
-            to_row(label) | {"quarantined": stored[label.decision_id].quarantined}
-            for label in labels.values()
-        ]
-        numbers = {id_: row.seq for id_, row in stored.items()}
-        new_numbers = self._database.insert(connection, LABEL.c.seq, rows)
-        return numbers | dict(zip(labels, new_numbers, strict=True))
 
     def _insert_events(
         self, connection: sa.Connection, events: Sequence[Event], problems: Sequence[str]

@@ -26,14 +26,12 @@ import struct
 import sys
 import threading
 import urllib.parse
-import urllib.request
 import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from hashlib import blake2b
-from io import FileIO
 from pathlib import Path
 from typing import Any
 
@@ -91,7 +89,7 @@ def encode_record(record: Record) -> bytes:
 def decode_record(blob: bytes) -> Record:
     """Return the record that `encode_record` wrote; raise StoreError for bytes that have no record.
 
-    A changed number or sample is not noticed here; `Journal.read` checks for that.
+    A changed number or sample is not noticed here; the journal checks for that.
     """
     with instead(
         StoreError,
@@ -177,7 +175,6 @@ class Journal:
         self.loss = ""
         self.head = read_head(path)
         self.entries: list[EntryName] = []
-        self._head_file: FileIO | None = None  # opened when it is written first
         # Guards what header and head hold: two threads write them.
         self._describing = threading.RLock()
         self._owning = owning
@@ -214,7 +211,7 @@ class Journal:
         Returns
         -------
         list of int
-            The offset of each record in bytes, for `read`.
+            The offset of each record in bytes, for `is_intact`.
 
         Raises
         ------
@@ -255,20 +252,14 @@ class Journal:
         with suppress(OSError), os.fdopen(open_plain(head, os.O_WRONLY), "wb") as file:
             sync(file.fileno())
 
-    def read(self, offset: int) -> bytes:
-        """Return the encoded record at an offset that `append` returned.
+    def is_intact(self, offset: int) -> bool:
+        """Return whether a record, whose CRC-32 fits, begins at an offset that `append` returned.
 
-        `decode_record` decodes it. Raise StoreError if no intact record, one whose CRC-32 fits,
-        begins there, or if the disk cannot be read.
+        False, too, if the disk cannot be read.
         """
-        with _os_errors(self.path):
-            record = self._read_record(offset)
-        if record is None:
-            raise StoreError(
-                f"Expected the record that was written to {self.path} at byte {offset}, found "
-                "another."
-            )
-        return record
+        with suppress(OSError):
+            return self._read_record(offset) is not None
+        return False
 
     def undrained_records(self) -> Iterator[tuple[int, int, bytes]]:
         """Yield (offset, end, encoded record) of the records that the store lacks, oldest first.
@@ -291,6 +282,22 @@ class Journal:
                 return
             begin += 1 + (mark if mark >= 0 else len(block) - len(MARK))
 
+    def decode_undrained(self) -> list[Record]:
+        """Return the records that the store lacks, oldest first, without those that are replaced.
+
+        If several decisions have one id, the last replaces the others. Damaged records are left
+        out; the attribute `loss` says so. Raise StoreError for an intact record that cannot be
+        decoded, like that of another release of dengine, and OSError if the disk cannot be read.
+        """
+        records = [decode_record(blob) for _, _, blob in self.undrained_records()]
+        decisions = [record for record in records if isinstance(record, StoredDecision)]
+        last = {item.decision.id: item for item in decisions}
+        return [
+            record
+            for record in records
+            if not isinstance(record, StoredDecision) or last[record.decision.id] is record
+        ]
+
     def save_newest_entry(self, newest: EntryName | None) -> None:
         """Write to header and head the newest ledger entry, and which records the store holds.
 
@@ -308,16 +315,13 @@ class Journal:
     def _write_head(self) -> None:
         """Write the attribute `head` to the small file beside the journal, without a sync.
 
-        The file is created if need be, and stays open. A failure is ignored. The caller holds
-        `_describing`.
+        The file is created if need be. A failure is ignored: an older head is harmless. The caller
+        holds `_describing`.
         """
-        # An older head is harmless. The file stays open, since each report writes it.
-        with suppress(OSError, ValueError):  # ValueError: closed by another thread meanwhile
-            if self._head_file is None:
-                descriptor = open_plain(head_path(self.path), os.O_WRONLY | os.O_CREAT)
-                self._head_file = os.fdopen(descriptor, "wb", buffering=0)
-            self._head_file.seek(0)
-            self._head_file.write(_pack_fields(vars(self.head)).ljust(HEADER))
+        with suppress(OSError):
+            descriptor = open_plain(head_path(self.path), os.O_WRONLY | os.O_CREAT)
+            with os.fdopen(descriptor, "wb") as file:
+                file.write(_pack_fields(vars(self.head)).ljust(HEADER))
 
     def clear(self) -> None:
         """Remove all records; the caller has made sure that the store holds them.
@@ -381,9 +385,6 @@ class Journal:
                     self._file.sync()  # the header, or a disk might keep the cut without it
                     self.end = HEADER
                 self._file.truncate(self.end)
-        if self._head_file is not None:
-            self._head_file.close()
-            self._head_file = None
         self._file.close()
 
     def _write_header(self) -> None:
@@ -546,15 +547,11 @@ def journal_path(url: Any, cell_id: str) -> Path:
 
 
 def sqlite_file(url: Any) -> Path:
-    """Return the path of the file of an SQLite URL or `file:` URI, absolute, links resolved.
+    """Return the path of the file of an SQLite URL, absolute, links resolved.
 
     So one file has one path, and one owner, whatever name it was opened by.
     """
-    database = str(url.database)
-    is_uri = database.startswith("file:")
-    return Path(
-        urllib.request.url2pathname(urllib.parse.urlsplit(database).path) if is_uri else database
-    ).resolve()
+    return Path(str(url.database)).resolve()
 
 
 def head_path(journal: Path) -> Path:
@@ -565,24 +562,16 @@ def head_path(journal: Path) -> Path:
 def read_undrained(path: Path) -> tuple[list[Record], Journal]:
     """Return the records of a journal that its store has not taken, and the journal, closed.
 
-    The records are oldest first. If several decisions have one id, only the last is returned.
-    Damaged records are left out; the journal's attribute `loss` says so. Nothing is locked or
-    changed, so an engine may be using the journal. Raise StoreError if the file cannot be opened or
+    The records are those of `Journal.decode_undrained`. Nothing is locked or changed, so an engine
+    may be using the journal. Raise StoreError if the file cannot be opened or
     is no journal, and for an intact record that cannot be decoded, like that of another release of
     dengine. If the disk fails later, while the records are read, OSError is raised.
     """
     journal = Journal(path, owning=False)
     try:
-        records = [decode_record(blob) for _, _, blob in journal.undrained_records()]
+        return journal.decode_undrained(), journal
     finally:
         journal.close()
-    last = {record.decision.id: record for record in records if isinstance(record, StoredDecision)}
-    newest = [
-        record
-        for record in records
-        if not isinstance(record, StoredDecision) or last[record.decision.id] is record
-    ]
-    return newest, journal
 
 
 def read_head(journal: Path) -> Head:

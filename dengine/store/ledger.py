@@ -440,7 +440,7 @@ def _find_table_error(
         .order_by(number)
     )
     for _, group in groupby(rows, lambda row: row.entry):
-        entry_rows = [row._mapping for row in group]
+        entry_rows = [dict(row._mapping) for row in group]
         if changed := [row for row in entry_rows if row_sum(name, row) != row["sum"]]:
             return f"the {name} {changed[0][number.name]} is not as it was written"
         chain = _extend_chain(chain, [row["sum"] for row in entry_rows])

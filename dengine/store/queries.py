@@ -263,6 +263,5 @@ def past_query(cell_id: str) -> sa.Select[Any]:
 
 def n_decisions(cell_id: str) -> sa.ScalarSelect[int]:
     """Return the scalar subquery for the number of a cell's newest decision, NULL if none."""
-    decision = DECISION.alias("every")
-    of_cell = decision.c.cell_id == cell_id
-    return sa.select(sa.func.max(decision.c.number)).where(of_cell).scalar_subquery()
+    query = sa.select(sa.func.max(DECISION.c.number)).where(DECISION.c.cell_id == cell_id)
+    return query.correlate(None).scalar_subquery()

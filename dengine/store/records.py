@@ -145,12 +145,15 @@ def check_state(report: RetrainReport, state: Arrays | None) -> State | None:
     Raise StoreError if `report.accepted` is True (the version is to be put in force) and `state` is
     None, and for an array of Python objects, which would need a pickle.
     """
-    if state is None and report.accepted:
-        raise StoreError(
-            f"Expected the arrays of accepted version {report.version}, got None; pass its state."
-        )
-    copies = None if state is None else {name: np.array(values) for name, values in state.items()}
-    for name, values in (copies or {}).items():
+    if state is None:
+        if report.accepted:
+            raise StoreError(
+                f"Expected the arrays of accepted version {report.version}, got None; pass its "
+                "state."
+            )
+        return None
+    copies = {name: np.array(values) for name, values in state.items()}
+    for name, values in copies.items():
         if values.dtype.hasobject:
             raise StoreError(f"Expected plain arrays, not {name!r}, which has {values.dtype}.")
     return copies
@@ -515,18 +518,13 @@ def columns(record_type: Any) -> dict[str, tuple[type, bool]]:
     """Return, by name, the type of each field of a record class, and whether it may be None.
 
     A record class is a dataclass or NamedTuple with type hints. The type is a plain one: that of
-    `dict[str, int]` is `dict`, and of a union, which must be one with None, it is the first that is
-    not None. The result is cached; do not change it.
+    `dict[str, int]` is `dict`, and of a union, which must be one with None as the last, it is the
+    first. The result is cached; do not change it.
     """
     fields: dict[str, tuple[type, bool]] = {}
     for name, hint in get_type_hints(record_type).items():
         is_union = isinstance(hint, UnionType)
-        types = [
-            option
-            for option in (get_args(hint) if is_union else (hint,))
-            if option is not type(None)
-        ]
-        fields[name] = (_plain_type(types[0]), is_union)
+        fields[name] = (_plain_type(get_args(hint)[0] if is_union else hint), is_union)
     return fields
 
 

@@ -99,17 +99,15 @@ class SqlStore(AbstractContextManager["SqlStore"]):
             StoreError,
         )
         self.cell_id = cell_id
-        is_valid = keep_versions is None or (type(keep_versions) is int and keep_versions >= 2)
         expect(
-            is_valid,
+            keep_versions is None or (type(keep_versions) is int and keep_versions >= 2),
             "keep_versions of 2 or more, or None for all",
             keep_versions,
             f"leave it at {KEEP}",
             StoreError,
         )
-        alone = product is None or url is not None
         expect(
-            alone,
+            product is None or url is not None,
             "no product of a store in memory",
             product,
             "name a file or a server, which its cells share",

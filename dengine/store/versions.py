@@ -213,9 +213,7 @@ class VersionTable(CellTable):
         query = sa.select(*VERSION.c["cell_id", "version", "last_seq", "state", "state_sum"])
         is_retrain = self._scope.shared(VERSION.c.cell_id) & (VERSION.c.retrain == retrain)
         row = self._read(query.where(is_retrain))[0]
-        if row.state is None or (
-            row.state_sum is not None and state_sum(row.state) != row.state_sum
-        ):
+        if row.state is None or state_sum(row.state) != row.state_sum:
             raise VersionError(
                 f"Expected the state of version {row.version} as it was stored in "
                 f"{self._database.name}, its bytes have changed; restore the store from a copy."

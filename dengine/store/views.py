@@ -115,15 +115,6 @@ class DecisionGroup:
     n: int
 
     @property
-    def is_false_reject(self) -> bool:
-        """Whether the model, not a force limit, rejected these parts, and they were good."""
-        return (
-            self.action is Action.REJECT
-            and self.reason is not Reason.OUTSIDE
-            and self.label == "good"
-        )
-
-    @property
     def label(self) -> str:
         """The corrected label in a word: good, bad, forgotten, overdue or none.
 
@@ -183,25 +174,26 @@ class Tally:
         an audit without a label that is not overdue is in no field. Nor are parts counted as
         rejected, or as false rejects, that an operator's limits rejected (`Reason.OUTSIDE`).
         """
+        actions = Counter[Action]()
         by_action = Counter[tuple[Action, str]]()
         audited = Counter[tuple[Action, str]]()  # by what the model alone would have done
-        for group in self.groups:
-            by_action[group.action, group.label] += group.n
-            audited[group.predicted, group.label] += group.n if group.audit else 0
-        actions = self.by("action")
         accept = Action.ACCEPT
         reject = Action.REJECT
-        outside = self.count(lambda group: (group.action, group.reason) == (reject, Reason.OUTSIDE))
+        for group in self.groups:
+            audited[group.predicted, group.label] += group.n if group.audit else 0
+            if (group.action, group.reason) != (reject, Reason.OUTSIDE):
+                actions[group.action] += group.n
+                by_action[group.action, group.label] += group.n
         return Outcomes(
             accepted=actions[accept],
             false_accepts=by_action[accept, "bad"],
             confirmed=by_action[accept, "good"],
             audited_accepts=audited[accept, "bad"] + audited[accept, "good"],
             audited_accepts_bad=audited[accept, "bad"],
-            rejected=actions[reject] - outside,
+            rejected=actions[reject],
             audited_rejects=audited[reject, "bad"] + audited[reject, "good"],
             audited_rejects_good=audited[reject, "good"],
-            false_rejects=self.count(lambda group: group.is_false_reject),
+            false_rejects=by_action[reject, "good"],
             forgotten_accepts=by_action[accept, "forgotten"],
             forgotten_audited_accepts=audited[accept, "forgotten"],
             forgotten_audited_rejects=audited[reject, "forgotten"],
