@@ -222,16 +222,17 @@ class DecisionTable(CellTable):
         -------
         int
         """
-        last = self._read(
-            sa.select(DECISION.c.number, DECISION.c.model_version)
-            .where(self._own(DECISION))
-            .order_by(DECISION.c.number.desc())
-            .limit(1)
+        number = DECISION.c.number
+        newest = self._read(
+            sa.select(number).where(
+                self._own(DECISION),
+                number == n_decisions(self._database.cell_id),
+                DECISION.c.model_version >= since_version,
+            )
         )
-        of_labels = sa.select(sa.func.max(LABEL.c.overdue_to)).where(self._own(LABEL))
-        by_labels = self._read(of_labels)[0][0] or 0
-        is_in_force = bool(last) and last[0].model_version >= since_version
-        return max(by_labels, last[0].number - within) if is_in_force else by_labels
+        of_labels = self._read(sa.select(sa.func.max(LABEL.c.overdue_to)).where(self._own(LABEL)))
+        numbers: list[int] = [of_labels[0][0] or 0, *(row.number - within for row in newest)]
+        return max(numbers)
 
     def tally(
         self, last: int | None = None, since_version: int = 0, within: int | None = None

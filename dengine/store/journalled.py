@@ -291,9 +291,10 @@ class JournalledStore(Outbox):
         It ends when that succeeds or the outbox is closed. Until then each id that is not in memory
         is looked up in the database.
         """
-        while not self._closed and not self._index.has_all_ids:
+        while not self._closed:
             try:
                 self.load_ids()
+                return
             except StoreError:
                 with self._changed:
                     self._changed.wait_for(lambda: self._closed, RETRY_SECONDS)

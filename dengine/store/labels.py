@@ -29,7 +29,6 @@ from .records import (
     FORGOTTEN,
     LabelledTraces,
     OutcomeRecord,
-    StoredDecision,
     from_row,
     overdue_outcomes,
     unpack,
@@ -188,8 +187,11 @@ class LabelTable(CellTable):
         rows = self._read(query if upto is None else query.where(LABEL.c.seq <= upto))
         damaged = {row.decision_id for row in rows if not is_intact(LABEL, row)}
         self._record_left_out(sorted(damaged), "label")
-        rows = [row for row in rows if row.decision_id not in damaged]
-        return [from_row(PastLabel, row._mapping, novel=row.reason == Reason.NOVEL) for row in rows]
+        return [
+            from_row(PastLabel, row._mapping, novel=row.reason == Reason.NOVEL)
+            for row in rows
+            if row.decision_id not in damaged
+        ]
 
     def outcomes_since(
         self, seq: int, since_version: int = 0, overdue_to: int = 0
@@ -246,10 +248,8 @@ class LabelTable(CellTable):
             )
             .order_by(LABEL.c.seq)
         )
-        overdue: deque[StoredDecision] = deque()
-        if overdue_to:
-            pending = self._decisions.pending(since_version)
-            overdue.extend(item for item in pending if item.number <= overdue_to)
+        pending = self._decisions.pending(since_version) if overdue_to else []
+        overdue = deque(item for item in pending if item.number <= overdue_to)
         outcomes: list[OutcomeRecord] = []
         for *values, last_overdue in rows:
             while overdue and overdue[0].number <= last_overdue:

@@ -236,9 +236,14 @@ def _extend_chain(chained: str, sums: Iterable[bytes]) -> str:
     return hashlib.sha256(chained.encode() + b"".join(sorted(sums))).hexdigest()
 
 
-def _settings_chain(settings: Mapping[str, str]) -> str:
-    """Return a SHA-256 over a cell's settings, hexadecimal; their order does not matter."""
-    return _extend_chain("", [json.dumps(settings, sort_keys=True).encode()])
+def _settings_chain(settings: str) -> str:
+    """Return a SHA-256 over a cell's settings, hexadecimal; `settings` is their JSON, sorted."""
+    return _extend_chain("", [settings.encode()])
+
+
+def _settings_text(connection: sa.Connection, cell_id: str) -> str:
+    """Return a cell's settings, without those that the store itself keeps, as JSON, sorted."""
+    return json.dumps(read_settings(connection, cell_id), sort_keys=True)
 
 
 def parse_object(text: Any) -> dict[str, Any]:
@@ -270,9 +275,13 @@ class LedgerEntry:
         self._cell_id = cell_id
         self._key = key
         last = newest_entry(connection, cell_id)
-        self._number: int = 1 if last is None else last.number + 1
-        self._previous: bytes = START if last is None else last.digest
-        self._chains = {} if last is None else parse_object(last.chains)
+        self._number = 1
+        self._previous = START
+        self._chains: dict[str, str] = {}
+        if last is not None:
+            self._number = last.number + 1
+            self._previous = last.digest
+            self._chains = parse_object(last.chains)
         self._sums: dict[str, list[bytes]] = {}
         self.settings = False
 
@@ -310,7 +319,7 @@ class LedgerEntry:
                 chains[name] = _extend_chain(chains.get(name, ""), self._sums[name])
         settings = None
         if self.settings:
-            settings = read_settings(self._connection, self._cell_id)
+            settings = _settings_text(self._connection, self._cell_id)
             chains[SETTING.name] = _settings_chain(settings)
         head = {
             "cell_id": self._cell_id,
@@ -319,34 +328,11 @@ class LedgerEntry:
             "added": json.dumps({table: len(sums) for table, sums in sorted(self._sums.items())}),
             "rows": rows_digest(self._sums),
             "chains": json.dumps(chains, sort_keys=True),
-            "settings": None if settings is None else json.dumps(settings, sort_keys=True),
+            "settings": settings,
         }
         digest = entry_digest(self._previous, head, self._key)
         self._connection.execute(sa.insert(LEDGER), head | {"digest": digest})
         return self._number, digest.hex()
-
-
-def find_settings_faults(connection: sa.Connection, cell_id: str) -> dict[str, str]:
-    """Compare a cell's settings with the newest copy of them in the ledger.
-
-    Return a text for each key that differs: "is not chained" if only the store has it, "is missing"
-    if only the ledger has it, else "was changed". {} if all are equal. A damaged or missing copy
-    counts as empty. The settings of the store itself (`RESERVED`) are not compared.
-    """
-    stored = read_settings(connection, cell_id)
-    is_copy = (LEDGER.c.cell_id == cell_id) & LEDGER.c.settings.is_not(None)
-    newest = sa.select(LEDGER.c.settings).where(is_copy).order_by(LEDGER.c.number.desc()).limit(1)
-    # An entry that was changed is found by the chain.
-    chained = parse_object(connection.execute(newest).scalar())
-    faults = {}
-    for key in sorted(stored.keys() | chained.keys()):
-        if key not in chained:
-            faults[key] = "is not chained"
-        elif key not in stored:
-            faults[key] = "is missing"
-        elif stored[key] != chained[key]:
-            faults[key] = "was changed"
-    return faults
 
 
 def find_integrity_error(connection: sa.Connection, cell_id: str, key: bytes, first: int) -> str:
@@ -385,8 +371,8 @@ def find_integrity_error(connection: sa.Connection, cell_id: str, key: bytes, fi
     if newest and entry_digest(previous, newest | {"digest": None}, key) != newest["digest"]:
         return "the newest entry of the ledger is not as it was written"
     chains = parse_object(newest.get("chains"))
-    settings = _settings_chain(read_settings(connection, cell_id))
-    if chains.get(SETTING.name, _settings_chain({})) != settings:
+    settings = _settings_chain(_settings_text(connection, cell_id))
+    if chains.get(SETTING.name, _settings_chain("{}")) != settings:
         return "the settings are not those of the ledger"
     last_entry = newest.get("number", 0)
     for name in IN_FORCE:

@@ -67,10 +67,10 @@ def open_store(
 
     if isinstance(store, SqlStore):
         return store
-    is_name = store is None or isinstance(store, str | os.PathLike)
-    expect(is_name, "None, a file, a URL or an SqlStore", store, error=StoreError)
     if store is None:
         return SqlStore()
+    is_name = isinstance(store, str | os.PathLike)
+    expect(is_name, "None, a file, a URL or an SqlStore", store, error=StoreError)
     url = store if isinstance(store, CellAddress) else CellAddress(os.fspath(store), "cell")
     if must_exist:
         check_cell_exists(url, url.cell_id)

@@ -158,7 +158,6 @@ class Outbox(ABC):
             decision is returned, and nothing is recorded.
         """
 
-    @abstractmethod
     def replace_decision(self, item: StoredDecision) -> StoredDecision:
         """Replace a recorded decision that was not returned to the caller yet, under the same id.
 
@@ -173,8 +172,10 @@ class Outbox(ABC):
         Raises
         ------
         KeyError
-            If no decision with this id is in memory.
+            If no decision with this id is in memory. Always for a store in memory, of which no
+            decision is late.
         """
+        raise KeyError(item.decision.id)
 
     def number_label(self) -> int:
         """Return the next number for a new label; each call uses up a number.

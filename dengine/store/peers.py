@@ -75,10 +75,10 @@ def check_peer_settings(
         return
     peer_values = _embedding_settings(peer_settings)
     values = _embedding_settings(settings)
+    if None in (values["trace"], peer_values["trace"]):
+        # The first trace of any cell sets the product's trace spec.
+        values["trace"] = peer_values["trace"]
     different = [key for key in values if values[key] != peer_values[key]]
-    # The first trace of any cell sets the product's trace spec.
-    if None in (values["trace"], peer_values["trace"]) and "trace" in different:
-        different.remove("trace")
     if different:
         expected = ", ".join(f"{key} {peer_values[key]}" for key in different)
         actual = ", ".join(f"{key} {values[key]}" for key in different)

@@ -54,6 +54,7 @@ NO_TRACE: TraceArray = np.zeros((0, 0), dtype=np.float32)
 # The first label and a second one that replaces it: silence confirmed the part, then it stopped the
 # line.
 LATE_STOP = (True, Source.CONFIRMED), (False, Source.STOP)
+LABEL_WORDS = {True: "good", False: "bad", None: "none"}
 FORGOTTEN = 2  # beside 0 and 1: a label that takes part in nothing any more
 CHUNK = 500  # rows sent or fetched at a time
 KEEP = 5  # newest versions that keep their states
@@ -98,12 +99,9 @@ def already_reported(
         f"{'success' if success else 'failure'} from {source.value}"
         for success, source in (first, second)
     )
-    same = first[0] == second[0]
-    advice = (
-        "nothing more needs reporting"
-        if same
-        else "if the first was wrong, look at how the part was checked"
-    )
+    advice = "nothing more needs reporting"
+    if first[0] != second[0]:
+        advice = "if the first was wrong, look at how the part was checked"
     return ReportConflictError(
         f"Expected one report a decision, got a second on {decision_id!r}: {stored} was reported "
         f"first and stands, now came {new}; {advice}."
@@ -245,9 +243,7 @@ class StoredDecision:
     @property
     def label(self) -> str:
         """The label in a word: good, bad or none."""
-        if self.success is None:
-            return "none"
-        return "good" if self.success else "bad"
+        return LABEL_WORDS[self.success]
 
     def with_label(self, label: NewLabel) -> Self:
         """Return a copy that has the success and the source of a label, not its number and time."""

@@ -126,15 +126,6 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         self._insertion = RecordInsertion(self.database, self.corrections)
         self._journal: Journal | None = None
 
-    def flush(self) -> None:
-        """Wait until the outbox's records are in the database, but not beyond its time limit.
-
-        Without an outbox nothing happens. Raise StoreError if the store is closed; if the database
-        of a running cell does not answer, nothing is raised.
-        """
-        self.database.check_open()
-        self.database.before_use()
-
     def claim_cell(self) -> Journal:
         """Claim the cell for this engine, and open its journal; `close` gives both up.
 

@@ -14,7 +14,7 @@ history anew, which a keyed ledger shows, or again a digest from elsewhere.
 import re
 import struct
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import islice
@@ -31,7 +31,6 @@ from .ledger import (
     START,
     check_key,
     entry_digest,
-    find_settings_faults,
     ledger_key,
     parse_object,
     row_sum,
@@ -51,6 +50,7 @@ from .schema import (
     TRACE,
     VERSION,
     read_setting,
+    read_settings,
 )
 
 # The column of each chained table that, with the cell, identifies a row.
@@ -194,16 +194,8 @@ def verify_history(
         checks = [CellCheck(connection, name, on_rows) for name in names]
         for check in checks:
             check_key(connection, check.cell_id, check.key)
-            faults += check.run()
             entries, _, loss = journals[check.cell_id]
-            if loss:
-                problem = f"is damaged: {loss} The next engine records that as an alarm"
-                faults.append(HistoryFault(check.cell_id, "journal", "", problem))
-            faults += [
-                HistoryFault(check.cell_id, LEDGER.name, f"entry {number}", CUT_OFF)
-                for number, digest in sorted(set(entries))
-                if digest not in check.digests
-            ]
+            faults += check.run(entries, loss)
     if expected and not any(
         digest.startswith(expected) for check in checks for digest in check.digests
     ):
@@ -292,44 +284,43 @@ class CellCheck:
         self._sums = {table: bytearray() for table in CHAINED}
         self._is_unreadable = False
 
-    def run(self) -> list[HistoryFault]:
+    def run(self, entries: Sequence[EntryName], loss: str) -> list[HistoryFault]:
         """Read all rows of the cell, and return what is wrong, table by table; [] if nothing is.
+
+        `entries` are the ledger entries that the cell's journal names, and `loss` says what is
+        damaged in the journal, "" if nothing is. Both are compared at the end.
 
         Fill `digests`, the digests of the ledger's entries, and `rows`, the number of rows read,
         and call `on_rows` with the number of rows just read. A database error is a fault, too, and
         not raised; after one, it is not checked whether decisions, traces and labels belong
         together.
         """
-        faults = [
-            fault
-            for table in CHAINED
-            for fault in self._catch_database_errors(table, self._check_rows(table))
+        checks = [(table, self._check_rows(table)) for table in CHAINED]
+        checks += [
+            (LEDGER.name, self._check_ledger()),
+            (SETTING.name, self._check_settings()),
+            (EVENT.name, self._check_losses()),
         ]
-        faults += self._catch_database_errors(LEDGER.name, self._check_ledger())
-        faults += self._catch_database_errors(SETTING.name, self._check_settings())
-        faults += self._catch_database_errors(EVENT.name, self._check_losses())
-        if not self._is_unreadable:  # else everything that cannot be read would be missing
-            for table, required in REQUIRED:
-                faults += self._catch_database_errors(
-                    table.name, self._check_pairs(table, required)
-                )
+        checks += [(table.name, self._check_pairs(table, required)) for table, required in REQUIRED]
+        faults: list[HistoryFault] = []
+        for table, check in checks:
+            try:
+                faults.extend(check)  # faults before an error stay
+            except sa.exc.DatabaseError as error:
+                self._is_unreadable = True
+                problem = f"cannot be read to its end: {error.orig}"
+                faults.append(self._fault(table, "", problem))
+        if loss:
+            problem = f"is damaged: {loss} The next engine records that as an alarm"
+            faults.append(self._fault("journal", "", problem))
+        faults += [
+            self._fault(LEDGER.name, f"entry {number}", CUT_OFF)
+            for number, digest in sorted(set(entries))
+            if digest not in self.digests
+        ]
         if self.on_rows is not None:
             self.on_rows(self.rows % CHUNK)
         return faults
-
-    def _catch_database_errors(
-        self, table: str, faults: Iterator[HistoryFault]
-    ) -> Iterator[HistoryFault]:
-        """Yield the faults of a check; a database error ends the check and is yielded as a fault.
-
-        `table` is the name of the table that this fault is about. After such an error `run` does
-        not look for missing rows.
-        """
-        try:
-            yield from faults
-        except sa.exc.DatabaseError as error:
-            self._is_unreadable = True
-            yield self._fault(table, "", f"cannot be read to its end: {error.orig}")
 
     def _fault(self, table: str, key: object, problem: str) -> HistoryFault:
         """Return a fault of this cell."""
@@ -384,9 +375,9 @@ class CellCheck:
 
         `digests` gets the digest of each entry, hexadecimal, oldest first. An entry must fit the
         digest of the entry before, and the sums of its rows as they are stored: that a row does not
-        fit its sum is a fault of its own. After an entry that was changed, only
-        this entry is a fault. Only the first 20 missing entries are yielded; those behind the
-        newest that an entry or a row names cannot be noticed.
+        fit its sum is a fault of its own. After an entry that was changed, only this entry is a
+        fault. Only the first 20 missing entries are yielded; those behind the newest that an entry
+        or a row names cannot be noticed.
         """
         sums = {table: np.frombuffer(packed, SUMS) for table, packed in self._sums.items()}
         sums = {
@@ -426,8 +417,18 @@ class CellCheck:
         (`RESERVED`), so a change of these is no fault here. If the setting with the version of the
         tables is missing (no engine has opened the cell), that is a fault, too.
         """
-        for key, problem in find_settings_faults(self.connection, self.cell_id).items():
-            yield self._fault(SETTING.name, key, problem)
+        stored = read_settings(self.connection, self.cell_id)
+        is_copy = (LEDGER.c.cell_id == self.cell_id) & LEDGER.c.settings.is_not(None)
+        copies = sa.select(LEDGER.c.settings).where(is_copy).order_by(LEDGER.c.number.desc())
+        # An entry that was changed is found by the chain.
+        chained = parse_object(self.connection.execute(copies.limit(1)).scalar())
+        for key in sorted(stored.keys() | chained.keys()):
+            if key not in chained:
+                yield self._fault(SETTING.name, key, "is not chained")
+            elif key not in stored:
+                yield self._fault(SETTING.name, key, "is missing")
+            elif stored[key] != chained[key]:
+                yield self._fault(SETTING.name, key, "was changed")
         if read_setting(self.connection, self.cell_id, SCHEMA_KEY) is None:
             yield self._fault(
                 SETTING.name, SCHEMA_KEY, "is missing: no engine has opened this cell"
@@ -442,8 +443,11 @@ class CellCheck:
     def _check_pairs(self, table: sa.Table, required: sa.Table) -> Iterator[HistoryFault]:
         """Yield a fault for each row of `table` that needs a row in `required` and has none.
 
+        None after an error of the database.
         The row that is needed has the same decision id. The fault names the table `required`.
         """
+        if self._is_unreadable:  # everything that could not be read would be missing
+            return
         keys, required_keys = (
             sa.select(part.c[KEY[part.name]]).where(part.c.cell_id == self.cell_id)
             for part in (table, required)

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from ..errors import expect
 from ..records import Action, Reason, Source
-from .records import Outcomes
+from .records import LABEL_WORDS, Outcomes
 
-LABELS: dict[str, bool | None] = {"good": True, "bad": False, "none": None}
+LABELS = {word: success for success, word in LABEL_WORDS.items()}
 OPTIONS: dict[str, Collection[str]] = {
     "action": list(Action),
     "predicted": list(Action),
@@ -68,7 +68,7 @@ class HistoryFilter:
 class PastLabel:
     """A label as it was recorded, with what a rule was updated with.
 
-    The fields up to `decided` are those of `NewLabel` and of the label's row, the others those of
+    The fields up to `point` are those of `NewLabel` and of the label's row, the others those of
     `OutcomeRecord`.
     """
 
@@ -82,7 +82,6 @@ class PastLabel:
     quarantined: bool
     silent: int
     point: NDArray[np.float32] | None
-    decided: float
     lower: float
     upper: float
     novel: bool
@@ -123,12 +122,11 @@ class DecisionGroup:
         there is no label and the check is not overdue, or none was asked for. A check of a
         quarantined trace (stored, but never used in training) is never overdue.
         """
-        if self.source is not None:
-            if self.success is None:
-                return "forgotten"
-            return "good" if self.success else "bad"
-        is_overdue = self.aged and self.action is Action.VERIFY and not self.quarantined
-        return "overdue" if is_overdue else "none"
+        if self.source is not None and self.success is None:
+            return "forgotten"
+        is_check = self.action is Action.VERIFY and not self.quarantined
+        is_overdue = self.source is None and self.aged and is_check
+        return "overdue" if is_overdue else LABEL_WORDS[self.success]
 
 
 @dataclass(frozen=True, slots=True)

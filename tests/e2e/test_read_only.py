@@ -70,7 +70,7 @@ def stores(tmp_path_factory, make_data):
     data, place = make_data(60, samples=80), tmp_path_factory.mktemp("made")
     with DataEngine("pca", retrain_every=30, store=str(place / "engine.db")) as engine:
         learn(engine, data, range(60))
-        engine.store.flush()
+        engine.flush()
         for name, suffixes in LEFT.items():
             (place / name).mkdir()
             for suffix in suffixes:
