@@ -104,10 +104,11 @@ class LabelTable(CellTable):
             sa.select(*TRACE.c, *columns, LABEL.c.decision_id.label("labelled_id"))
             .select_from(LABEL.outerjoin(TRACE, TRACE_OF_LABEL))
             .where(scope.shared(LABEL.c.cell_id), TRAINS, label != FORGOTTEN)
-            .where(LABEL.c.seq >= int(first), *[] if last is None else [LABEL.c.seq <= last])
+            .where(LABEL.c.seq >= int(first))
             .order_by(LABEL.c.seq.desc())
             .limit(limit)
         )
+        query = query if last is None else query.where(LABEL.c.seq <= last)
         kept = []
         traces = []
         damaged = []

@@ -5,7 +5,6 @@ into a product. `SqlStore` and `Database` compose their statements from them.
 """
 
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any
 
 import sqlalchemy as sa
@@ -116,8 +115,6 @@ def cells_of(product: str) -> sa.Select[Any]:
     )
 
 
-# For a few products and columns: building the statement takes longer than running it.
-@lru_cache(maxsize=100)
 def newest_of(
     product: str, column: sa.Column[Any], *conditions: sa.ColumnElement[bool]
 ) -> sa.Select[Any]:

@@ -277,7 +277,7 @@ class CellCheck:
     ) -> None:
         self.connection = connection
         self.cell_id = cell_id
-        self.on_rows = on_rows
+        self._on_rows = on_rows or (lambda n_rows: None)
         self.key = ledger_key()
         self.digests: list[str] = []
         self.rows = 0
@@ -318,8 +318,7 @@ class CellCheck:
             for number, digest in sorted(set(entries))
             if digest not in self.digests
         ]
-        if self.on_rows is not None:
-            self.on_rows(self.rows % CHUNK)
+        self._on_rows(self.rows % CHUNK)
         return faults
 
     def _fault(self, table: str, key: object, problem: str) -> HistoryFault:
@@ -351,8 +350,8 @@ class CellCheck:
         """
         for row in self._read_raw(table):
             self.rows += 1
-            if self.on_rows is not None and self.rows % CHUNK == 0:
-                self.on_rows(CHUNK)
+            if self.rows % CHUNK == 0:
+                self._on_rows(CHUNK)
             key = row[KEY[table]]
             entry = row["entry"]
             stored = row["sum"]
