@@ -67,8 +67,10 @@ def make_engine(url: str | None) -> sa.Engine:
         installed. The message has no password.
     """
     if url is None:
-        options = {"poolclass": sa.pool.StaticPool, "connect_args": {"check_same_thread": False}}
-        return _with_sqlite_events(sa.create_engine("sqlite://", **options))
+        arguments = {"check_same_thread": False}
+        return _with_sqlite_events(
+            sa.create_engine("sqlite://", poolclass=sa.pool.StaticPool, connect_args=arguments)
+        )
     expect(
         as_text(url) == url,
         "a file or a database URL of UTF-8 without a NUL",

@@ -149,12 +149,14 @@ class RecordInsertion:
         An event is left out if the cell has one with the same time, kind and text; a "dead letter",
         which has the present time, is not. Nothing is committed.
         """
-        times = [event.time for event in events]
-        query = sa.select(EVENT.c.time, EVENT.c.kind, EVENT.c.text).where(
-            self._database.own(EVENT), EVENT.c.time.in_(times)
-        )
-        stored = {tuple(row) for row in connection.execute(query)}
-        new = [event for event in events if (event.time, event.kind, event.text) not in stored]
+        new = []
+        if events:
+            times = [event.time for event in events]
+            query = sa.select(EVENT.c.time, EVENT.c.kind, EVENT.c.text).where(
+                self._database.own(EVENT), EVENT.c.time.in_(times)
+            )
+            stored = {tuple(row) for row in connection.execute(query)}
+            new = [event for event in events if (event.time, event.kind, event.text) not in stored]
         for problem in problems:
             log.error("dead letter: %s", problem)
             new.append(new_event("dead letter", problem, self._database.clock()))

@@ -118,11 +118,9 @@ class JournalledStore(Outbox):
         database fails, or another release wrote a record, and OSError if the journal cannot be
         read; the records that were not copied then stay in the journal.
         """
-        newest = self.store.decisions.select(HistoryFilter(), limit=1)
-        since = "".join(
-            f" They came after decision {item.decision.id} of {item.when:%F %T} UTC."
-            for item in newest
-        )
+        since = ""
+        for item in self.store.decisions.select(HistoryFilter(), limit=1):
+            since = f" They came after decision {item.decision.id} of {item.when:%F %T} UTC."
         for records in chunks(self._journal.decode_undrained()):
             self.store.apply_records(records)
         if self._journal.loss:

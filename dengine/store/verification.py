@@ -378,10 +378,10 @@ class CellCheck:
         fault. Only the first 20 missing entries are yielded; those behind the newest that an entry
         or a row names cannot be noticed.
         """
-        sums = {table: np.frombuffer(packed, SUMS) for table, packed in self._sums.items()}
-        sums = {
-            table: rows[np.argsort(rows["entry"], kind="stable")] for table, rows in sums.items()
-        }
+        sums = {}
+        for table, packed in self._sums.items():
+            rows = np.frombuffer(packed, SUMS)
+            sums[table] = rows[np.argsort(rows["entry"])]
         numbers: set[int] = set()
         previous = {START}
         for row in sorted(self._read_raw(LEDGER.name), key=lambda row: _integer(row["number"])):
