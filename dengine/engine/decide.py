@@ -175,8 +175,7 @@ class DecisionMaker:
         Returns
         -------
         StoredDecision
-            The record with its number, which is 0 if it could not be recorded, because too many
-            records wait for the disk. If another thread has recorded a decision for the id
+            The record with its number. If another thread has recorded a decision for the id
             meanwhile, that decision is returned. Before the first training the decision is VERIFY,
             `Reason.NO_MODEL`, unless the trace has a fault or is outside a force limit. If the
             model raises, or returns bounds that are not 0 <= lower <= upper <= 1, that is logged,

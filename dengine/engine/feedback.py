@@ -126,14 +126,13 @@ class Feedback:
     def record_decision(self, stored: StoredDecision) -> None:
         """Note a new decision: VERIFY as a pending check, ACCEPT as a part without an outcome.
 
-        A VERIFY of a trace with a fault is not pending, nor is a VERIFY that could not be recorded
-        (its number is 0). The rule counts each check that has become overdue as a wrong decision
-        (`_count_overdue`). When more than 80 % of the decisions have `Reason.NOVEL`, in a mean that
-        fades over 50 decisions and begins at 0, an event is recorded, and the next such event only
-        after this share has fallen to one half or less.
+        A VERIFY of a trace with a fault is not pending. The rule counts each check that has become
+        overdue as a wrong decision (`_count_overdue`). When more than 80 % of the decisions have
+        `Reason.NOVEL`, in a mean that fades over 50 decisions and begins at 0, an event is
+        recorded, and the next such event only after this share has fallen to one half or less.
         """
         decision = stored.decision
-        if decision.action is Action.VERIFY and not stored.quarantined and stored.number:
+        if decision.action is Action.VERIFY and not stored.quarantined:
             self._awaiting_check[decision.id] = stored
         self._count_overdue()
         if decision.action is Action.ACCEPT:

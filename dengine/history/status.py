@@ -647,9 +647,10 @@ def read_course(store: SqlStore, **by: float) -> Course:
     ----------
     store : SqlStore
     **by
-        `seconds` and `start`, for stretches that are periods of time (see `stretches_query`); only
-        the newest 120 with decisions are returned. Without them all decisions of the cell are split
-        into at most 120 stretches of equal number, at least 20 each; the newest may have fewer.
+        `seconds` and `start`, for stretches that are periods of time (`DecisionTable.stretches`);
+        only the newest 120 with decisions are returned. Without them all decisions of the cell are
+        split into at most 120 stretches of equal number, at least 20 each; the newest may have
+        fewer.
 
     Returns
     -------

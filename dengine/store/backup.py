@@ -103,7 +103,9 @@ def backup_store(url: FilePath, out: FilePath) -> BackupReport:
                 sqlite3.Error,
                 do="choose a folder that has room",
             ):
-                _copy(connection, partial)
+                with closing(sqlite3.connect(partial)) as copy:  # by SQLite's own online backup
+                    source: Any = connection.connection.driver_connection
+                    source.backup(copy)
                 for cell, records in waiting.items():
                     _add_records(partial, cell, records)
                 decisions, labels = _fold_wal_and_count(partial)
@@ -159,16 +161,6 @@ def restore_store(copy: FilePath, store: FilePath) -> tuple[CellHistory, ...]:
             journal.save_newest_entry((cell.entries, cell.digest))
             journal.close()
     return report.cells
-
-
-def _copy(connection: sa.Connection, target: Path) -> None:
-    """Copy an SQLite store into the file `target` by SQLite's own online backup.
-
-    The copy replaces what `target` held. Raise sqlite3.Error if either file fails.
-    """
-    with closing(sqlite3.connect(target)) as copy:
-        source: Any = connection.connection.driver_connection
-        source.backup(copy)
 
 
 def _add_records(file: Path, cell: str, records: list[Record]) -> None:

@@ -8,14 +8,11 @@ of cells use `reading`.
 
 import hashlib
 import os
-import shutil
 import sqlite3
 import threading
-import weakref
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any, TypeVar
 
 import sqlalchemy as sa
@@ -66,12 +63,14 @@ def make_engine(url: str | None) -> sa.Engine:
     ------
     StoreError
         For any other database, for a URL that cannot be read, has a NUL or is not UTF-8, for an
-        SQLite URL in memory, and if the driver of PostgreSQL is not installed. The message has no
-        password.
+        SQLite URL in memory or with a `file:` URI, and if the driver of PostgreSQL is not
+        installed. The message has no password.
     """
     if url is None:
-        options = {"poolclass": sa.pool.StaticPool, "connect_args": {"check_same_thread": False}}
-        return _with_sqlite_events(sa.create_engine("sqlite://", **options))
+        arguments = {"check_same_thread": False}
+        return _with_sqlite_events(
+            sa.create_engine("sqlite://", poolclass=sa.pool.StaticPool, connect_args=arguments)
+        )
     expect(
         as_text(url) == url,
         "a file or a database URL of UTF-8 without a NUL",
@@ -86,9 +85,10 @@ def make_engine(url: str | None) -> sa.Engine:
         if parsed.drivername in ("postgres", "postgresql"):
             parsed = parsed.set(drivername="postgresql+psycopg")
         backend = parsed.get_backend_name()
-        in_file = backend == "sqlite" and parsed.database not in (None, "", ":memory:")
+        # A name `file:` is a URI of SQLite's own, which may mean anything.
+        is_file = not (parsed.database or ":memory:").startswith((":memory:", "file:"))
         expect(
-            backend == "postgresql" or in_file,
+            backend == "postgresql" or (backend == "sqlite" and is_file),
             "a file, an SQLite file URL or a PostgreSQL URL",
             parsed.render_as_string(),
             "for a store that forgets use store=None",
@@ -98,12 +98,14 @@ def make_engine(url: str | None) -> sa.Engine:
             return sa.create_engine(parsed, pool_pre_ping=True, connect_args=TIMEOUTS)
         return _with_sqlite_events(sa.create_engine(parsed, connect_args={"timeout": BUSY_SECONDS}))
     except (sa.exc.ArgumentError, ImportError, ValueError) as error:
+        reason = f"{error}"
         if isinstance(error, ValueError) and "@" in url:
             # The error may quote half of a password, which it took for a port.
-            raise _unusable_url(
-                url, "it cannot be read; write @, : and / in a password as %40, %3A and %2F"
-            ) from None
-        raise _unusable_url(url, f"{error}") from error
+            reason = "it cannot be read; write @, : and / in a password as %40, %3A and %2F"
+        raise StoreError(
+            f"Expected a file or a database URL that can be used here, got "
+            f"{url.split('@')[-1]!r}: {reason}. For PostgreSQL: pip install 'dengine[postgres]'."
+        ) from None  # the error may have the password
 
 
 def _with_sqlite_events(engine: sa.Engine) -> sa.Engine:
@@ -118,67 +120,22 @@ def _with_sqlite_events(engine: sa.Engine) -> sa.Engine:
     return engine
 
 
-def _unusable_url(url: str, reason: str) -> StoreError:
-    """Return the StoreError for a URL that cannot be used, with the reason.
-
-    The message quotes only the part of the URL behind the last @, so that no password is in it.
-    """
-    return StoreError(
-        f"Expected a file or a database URL that can be used here, got {url.split('@')[-1]!r}: "
-        f"{reason}. For PostgreSQL: pip install 'dengine[postgres]'."
-    )
-
-
-class CopyConnection(sqlite3.Connection):
-    """An SQLite connection to a temporary copy of a file; the copy is deleted with it."""
-
-
 def _connect_sqlite(
     dialect: Any, record: Any, arguments: Sequence[Any], options: Mapping[str, Any]
 ) -> Any:
     """Return a new SQLite connection; it only reads if the file or its folder cannot be written.
 
     SQLAlchemy calls this with its dialect, its own record of the connection, which is not used, and
-    the arguments and options for `sqlite3.connect`; the first argument is the file. Such a file
-    without a `-wal` beside it is opened as immutable. If it has a `-wal`, but no `-shm` and SQLite
-    cannot create that, both files are copied to a temporary folder, which is deleted with the
-    connection, and the copy is opened for reading. A new file and a `file:` URI are opened in the
-    driver's own way. A damaged file raises nothing here, but when the connection is used. Raise
-    sqlite3.Error if the file cannot be opened, and OSError if it cannot be copied.
+    the arguments and options for `sqlite3.connect`; the first argument is the file. If it or its
+    folder cannot be written, and it has no `-wal` beside it, it is opened as immutable. Every other
+    file is opened in the driver's own way. A damaged file raises nothing here, but when the
+    connection is used. Raise sqlite3.Error if the file cannot be opened.
     """
-    name = str(arguments[0])
-    file = Path(name)
-    log_file = Path(f"{name}-wal")
-    shared = Path(f"{name}-shm")
-    if options.get("uri") or not file.is_file():
-        return dialect.connect(*arguments, **options)
-    if log_file.exists() or os.access(file, os.W_OK):
-        connection = dialect.connect(*arguments, **options)
-        try:
-            connection.execute("PRAGMA schema_version").fetchone()  # reads the first page alone
-        except sqlite3.Error as error:
-            if not _is_unwritable(error) or shared.exists():
-                return connection  # the error comes again when the connection is used
-            connection.close()
-        else:
-            return connection
-    if not log_file.exists():
+    file = Path(str(arguments[0]))
+    is_closed = file.is_file() and not Path(f"{file}-wal").exists()
+    if is_closed and not (os.access(file, os.W_OK) and os.access(file.parent, os.W_OK)):
         return dialect.connect(f"{file.absolute().as_uri()}?immutable=1", uri=True, **options)
-    folder = TemporaryDirectory(prefix="dengine-", ignore_cleanup_errors=True)
-    for source in (file, log_file):
-        shutil.copyfile(source, Path(folder.name) / source.name)
-    # For reading: what was written to a copy would be lost.
-    copied = f"{(Path(folder.name) / file.name).as_uri()}?mode=ro"
-    copy = dialect.connect(copied, uri=True, factory=CopyConnection, **options)
-    weakref.finalize(copy, folder.cleanup)
-    return copy
-
-
-def _is_unwritable(error: Exception) -> bool:
-    """Return whether an SQLite error says that a file is read-only, or cannot be opened."""
-    # An extended code has more in its higher bits
-    code = getattr(error, "sqlite_errorcode", 0) & 0xFF
-    return code in (sqlite3.SQLITE_READONLY, sqlite3.SQLITE_CANTOPEN)
+    return dialect.connect(*arguments, **options)
 
 
 def _set_pragmas(connection: Any, record: Any) -> None:
@@ -199,8 +156,9 @@ def _set_pragmas(connection: Any, record: Any) -> None:
             connection.execute("PRAGMA page_size = 16384")
             connection.execute("PRAGMA journal_mode = WAL")
     except sqlite3.OperationalError as error:
-        if not _is_unwritable(error):  # such a file keeps its mode, and is read
-            raise
+        primary_code = error.sqlite_errorcode & 0xFF  # without the bits of an extended code
+        if primary_code not in (sqlite3.SQLITE_READONLY, sqlite3.SQLITE_CANTOPEN):
+            raise  # else the file keeps its mode, and is read
     except UnicodeDecodeError as error:  # SQLite's error quotes a damaged table name
         raise sqlite3.DatabaseError("the database is malformed") from error
     # A returned commit survives a power failure; with NORMAL it would not.
@@ -275,13 +233,12 @@ def reading(url: str) -> Iterator[sa.Connection]:
         TypeError, OverflowError or OSError that the block raises, unless it is dengine's own.
     """
     engine = make_engine(url)
-    name = engine.url.render_as_string(hide_password=True)
+    name = engine.url.render_as_string()
     sqlite = engine.dialect.name == "sqlite"
     options = {} if sqlite else {"isolation_level": "REPEATABLE READ", "postgresql_readonly": True}
     try:
         file = str(engine.url.database)
-        # A `file:` name is a URI of SQLite's own.
-        if sqlite and not (Path(file).is_file() or file.startswith("file:")):
+        if sqlite and not Path(file).is_file():
             raise StoreError(
                 f"Expected a store that an engine has used, found no file {file}; make a "
                 "DataEngine with it, or let `dengine train` or `dengine run` make one."
@@ -373,7 +330,7 @@ class Database:
         self._engine = self._writer = make_engine(url)
         chain_writes(self._engine)
         self.url = self._engine.url  # its password included
-        self.name = self.url.render_as_string(hide_password=True)
+        self.name = self.url.render_as_string()
         self.scope = self._open(product)
         # The file with what it was when it was opened. None: in memory, or a server.
         self._file: tuple[Path, os.stat_result] | None = None
@@ -485,9 +442,7 @@ class Database:
         Raise StoreError if the database fails.
         """
         rows = self.read(
-            sa.select(LEDGER.c.digest).where(
-                LEDGER.c.cell_id == self.cell_id, LEDGER.c.number == number
-            )
+            sa.select(LEDGER.c.digest).where(self.own(LEDGER), LEDGER.c.number == number)
         )
         return [row.digest.hex() for row in rows] == [digest]
 
@@ -697,20 +652,16 @@ class Database:
         list of int
             The numbers, in the order of the rows; empty without rows.
         """
-        numbers: list[int] = []
-        if rows:
-            number = self.scope.next_number(connection, column)
-            for row in rows:
-                number = max(number, row.get(column.name, 0))
-                numbers.append(number)
-                number += 1
-            common = {"cell_id": self.cell_id}
-            numbered = [
-                {**row, **common, column.name: number}
-                for row, number in zip(rows, numbers, strict=True)
-            ]
-            connection.execute(sa.insert(column.table), numbered)
-        return numbers
+        if not rows:
+            return []
+        number = self.scope.next_number(connection, column)
+        numbered = []
+        for row in rows:
+            number = max(number, row.get(column.name, 0))
+            numbered.append({**row, "cell_id": self.cell_id, column.name: number})
+            number += 1
+        connection.execute(sa.insert(column.table), numbered)
+        return [row[column.name] for row in numbered]
 
     def rows_by_id(
         self, connection: sa.Connection, query: sa.Select[Any], ids: Sequence[str]
@@ -720,7 +671,7 @@ class Database:
         `query` selects from the table `decision`, its column `id` included, and is limited to this
         cell here. Return the rows by id; ids without a row are left out. Without ids no query runs.
         """
-        query = query.where(DECISION.c.cell_id == self.cell_id)
+        query = query.where(self.own(DECISION))
         return {
             row.id: row
             for part in chunks(ids)

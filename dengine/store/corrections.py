@@ -93,13 +93,16 @@ class CorrectionTable(CellTable):
         for a decision that is unknown or has no label.
         """
         stored = self.stored_labels(connection, ids)
+        values = {0: False, 1: True, FORGOTTEN: None}
+        labels = {}
         for id_ in ids:
             if id_ not in stored:
                 raise unknown_decision(id_)
-            if stored[id_].corrected is None:
+            corrected = stored[id_].corrected
+            if corrected is None:
                 raise nothing_to_correct(id_)
-        labels = {0: False, 1: True, FORGOTTEN: None}
-        return {id_: labels[stored[id_].corrected] for id_ in ids}
+            labels[id_] = values[corrected]
+        return labels
 
     def newest_number(self) -> int:
         """Return the number of the newest correction of the cell or its product; 0: none yet."""

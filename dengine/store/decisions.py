@@ -20,7 +20,6 @@ from .queries import (
     WITH_LABELS,
     n_decisions,
     past_query,
-    stretches_query,
 )
 from .records import CHUNK, StoredDecision, from_row, read_decision
 from .schema import CORRECTION, DECISION, LABEL, TRACE
@@ -129,10 +128,9 @@ class DecisionTable(CellTable):
             conditions.append(DECISION.c.time < where.until)
         number = DECISION.c.number
         if start_after is not None:
-            other = DECISION.alias("other")
-            is_other = self._own(other) & (other.c.id == start_after)
-            limit_number = sa.select(other.c.number).where(is_other).scalar_subquery()
-            conditions.append(number < limit_number if newest else number > limit_number)
+            is_start = self._own(DECISION) & (DECISION.c.id == start_after)
+            start = sa.select(number).where(is_start).correlate(None).scalar_subquery()
+            conditions.append(number < start if newest else number > start)
         rows = self._read(
             past_query(self._database.cell_id)
             .where(*conditions)
@@ -224,16 +222,17 @@ class DecisionTable(CellTable):
         -------
         int
         """
-        last = self._read(
-            sa.select(DECISION.c.number, DECISION.c.model_version)
-            .where(self._own(DECISION))
-            .order_by(DECISION.c.number.desc())
-            .limit(1)
+        number = DECISION.c.number
+        newest = self._read(
+            sa.select(number).where(
+                self._own(DECISION),
+                number == n_decisions(self._database.cell_id),
+                DECISION.c.model_version >= since_version,
+            )
         )
-        of_labels = sa.select(sa.func.max(LABEL.c.overdue_to)).where(self._own(LABEL))
-        by_labels = self._read(of_labels)[0][0] or 0
-        is_in_force = bool(last) and last[0].model_version >= since_version
-        return max(by_labels, last[0].number - within) if is_in_force else by_labels
+        of_labels = self._read(sa.select(sa.func.max(LABEL.c.overdue_to)).where(self._own(LABEL)))
+        numbers: list[int] = [of_labels[0][0] or 0, *(row.number - within for row in newest)]
+        return max(numbers)
 
     def tally(
         self, last: int | None = None, since_version: int = 0, within: int | None = None
@@ -258,7 +257,7 @@ class DecisionTable(CellTable):
         -------
         Tally
             The groups, in no order, with the number of decisions in each; the smallest and the
-            largest time of these decisions, and the largest of their labels, None without any.
+            largest time of these decisions, None without any.
         """
         newest = n_decisions(self._database.cell_id)
         aged = (sa.false() if within is None else newest - DECISION.c.number >= within).label(
@@ -273,9 +272,8 @@ class DecisionTable(CellTable):
             sa.func.count().label("n"),
         )
         times = (
-            sa.func.min(DECISION.c.time),
-            sa.func.max(DECISION.c.time),
-            sa.func.max(LABEL.c.time),
+            sa.func.min(DECISION.c.time).label("first"),
+            sa.func.max(DECISION.c.time).label("last"),
         )
         query = (
             sa.select(*group, *times)
@@ -284,15 +282,13 @@ class DecisionTable(CellTable):
             .where(self._own(DECISION), DECISION.c.model_version >= since_version)
         )
         rows = self._read(query if last is None else query.where(DECISION.c.number > newest - last))
-        first, latest, label = (
-            [row[i] for row in rows if row[i] is not None] for i in (-3, -2, -1)
-        )
-        groups = tuple(from_row(DecisionGroup, row._mapping) for row in rows)
         return Tally(
-            groups, min(first, default=None), max(latest, default=None), max(label, default=None)
+            groups=tuple(from_row(DecisionGroup, row._mapping) for row in rows),
+            first=min((row.first for row in rows), default=None),
+            last=max((row.last for row in rows), default=None),
         )
 
-    def stretches(self, n: int = 1, **by: Any) -> list[Stretch]:
+    def stretches(self, n: int = 1, seconds: float = 0.0, start: float = 0.0) -> list[Stretch]:
         """Count the cell's decisions in at most `n` stretches of equal length, oldest first.
 
         A stretch is a run of consecutive decisions, or a period of time. The newest stretch may be
@@ -302,16 +298,38 @@ class DecisionTable(CellTable):
         ----------
         n : int, default 1
             Number of stretches of decisions at most, 1 or more; without effect on periods of time.
-        **by
-            For periods of time: `seconds`, the length of a period, and `start`, a time in seconds
-            since 1970 at which a period begins (0.0 by default).
+        seconds : float, default 0.0
+            Length of a period of time; 0.0: the stretches are runs of decisions.
+        start : float, default 0.0
+            A time, in seconds since 1970, at which a period begins.
 
         Returns
         -------
         list of Stretch
+            Sorted by their newest decision.
         """
-        length = max(1, -(-self.newest_number() // n))
-        rows = self._read(stretches_query(self._database.cell_id, length, **by))
+        if seconds:
+            stretch: sa.ColumnElement[Any] = sa.func.floor((DECISION.c.time - start) / seconds)
+        else:
+            length = max(1, -(-self.newest_number() // n))
+            stretch = (DECISION.c.number - 1) // length
+        verified, accepted, rejected = (DECISION.c.action == action.value for action in Action)
+        novel, outside = (
+            DECISION.c.reason == reason.value for reason in (Reason.NOVEL, Reason.OUTSIDE)
+        )
+        false_accepted = accepted & (SUCCESS == 0)
+        # In the order of the fields of `Stretch`.
+        conditions = (verified, novel, accepted, false_accepted, rejected & ~outside, outside)
+        counts: list[sa.ColumnElement[Any]] = [
+            sa.func.sum(sa.case((condition, 1), else_=0)) for condition in conditions
+        ]
+        rows = self._read(
+            sa.select(*[sa.func.count(), sa.func.max(DECISION.c.time), *counts])
+            .select_from(WITH_LABELS)
+            .where(self._own(DECISION))
+            .group_by(stretch)
+            .order_by(sa.func.max(DECISION.c.number))
+        )
         return [Stretch(*row) for row in rows]
 
     def counts(self, tally: Tally | None = None) -> dict[str, Any]:

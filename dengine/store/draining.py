@@ -14,11 +14,11 @@ from contextlib import suppress
 from itertools import islice
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from ..errors import StoreError, listed, log
-from .journal import Journal, Record, decode_record
+from ..errors import StoreError, log
+from .journal import Journal
 from .lookup import DecisionIndex
 from .recording import RETRY_SECONDS, Recorder
-from .records import DATA_LOST, LOSS_REMEDY, LabelNumbers
+from .records import CHUNK, DATA_LOST, LOSS_REMEDY, LabelNumbers
 
 if TYPE_CHECKING:
     from .sql import SqlStore
@@ -27,7 +27,6 @@ T = TypeVar("T")
 DRAIN_SECONDS = 0.25  # synced records wait so long for others before they are drained together
 LAG_SECONDS = 1.0  # a larger lag is a fault of the store
 COMMIT_SECONDS = 2.0  # beyond the time limit, for a commit under way: it may still succeed
-DRAIN_CHUNK = 500  # records that the database takes in one transaction
 
 
 class Drainer:
@@ -48,7 +47,7 @@ class Drainer:
     Attributes
     ----------
     n_drained : int
-        Number of records that the database has, or that are lost.
+        Number of records that the database has.
     """
 
     def __init__(
@@ -75,7 +74,7 @@ class Drainer:
 
     @property
     def is_drained(self) -> bool:
-        """Whether the database has every record, except those that are lost."""
+        """Whether the database has every record."""
         return self.n_drained == self._recorder.n_recorded
 
     @property
@@ -108,24 +107,25 @@ class Drainer:
             self._wanted = self._recorder.n_recorded
             self._recorder.request_sync()
 
-    def drain(self) -> None:
+    def drain(self, seconds: float | None = None) -> None:
         """Have everything recorded so far copied to the database, and wait for it.
 
         If the database has everything, nothing is done. Raise StoreError if this takes longer than
-        `limit` seconds, or as soon as there is a `fault`, which is a reason why the store cannot be
-        used now; the copying is requested even so. The records then stay in the journal, or in
-        memory if the disk fails, and are copied later. After a timeout there is a `fault` until the
-        database takes records again.
+        `seconds` (None: `limit`), or as soon as there is a `fault`, which is a reason why the store
+        cannot be used now; the copying is requested even so. The records then stay in the journal,
+        or in memory if the disk fails, and are copied later. After a timeout there is a `fault`
+        until the database takes records again.
         """
+        limit = self._limit if seconds is None else seconds
         with self._changed:
             if self.is_drained:
                 return
             self.request()
             place = self._wanted
             if not self._changed.wait_for(
-                lambda: self.n_drained >= place or bool(self.fault), self._limit
+                lambda: self.n_drained >= place or bool(self.fault), limit
             ):
-                self._error = f"no answer from the store within {self._limit:g} s."
+                self._error = f"no answer from the store within {limit:g} s."
             if self.n_drained < place:
                 raise self._unavailable()
 
@@ -199,14 +199,6 @@ class Drainer:
         """
         self._thread.start()
         self._store.database.before_use = self._drain_before_use
-
-    def wait_for_store(self, seconds: float) -> None:
-        """Wait until the database has every record, a fault shows that it will not, or time is up.
-
-        Nothing is returned or raised: `is_drained` says which.
-        """
-        with self._changed:
-            self._changed.wait_for(lambda: self.is_drained or bool(self.fault), seconds)
 
     def stop(self, seconds: float) -> bool:
         """End the thread, wait for it, and return whether it ended within these seconds.
@@ -290,8 +282,8 @@ class Drainer:
     def _drain_synced(self) -> None:
         """Copy all records that are on the journal's disk by now to the database.
 
-        They go in chunks of at most DRAIN_CHUNK (500) records. Later records go with them only if
-        they still fit into the last chunk. The journal's head, the small file beside it, is synced
+        They go in chunks of at most CHUNK (500) records. Later records go with them only if they
+        still fit into the last chunk. The journal's head, the small file beside it, is synced
         first. At the end, or at once if there are no records, the last error, which `fault` shows,
         is cleared. Raise StoreError if the database fails: chunks that were committed stay, and the
         last error is kept.
@@ -300,45 +292,31 @@ class Drainer:
         if self.n_drained < synced_to:
             self._journal.sync_head()
         while self.n_drained < synced_to:
-            self.drain_chunk()
+            self._drain_chunk()
         self._error = ""
 
-    def drain_chunk(self) -> None:
-        """Commit the oldest records that are on the journal's disk, at most DRAIN_CHUNK (500).
+    def _drain_chunk(self) -> None:
+        """Commit the oldest records that are on the journal's disk, at most CHUNK (500).
 
         There must be one. A decision is left out if a later record with the same id replaces it.
-        Records that are damaged on disk, or cannot be read, are taken from memory and reported by
-        an event, which is also logged. If a decision is not in memory either, it is lost, and the
-        kind of that event is DATA_LOST, an alarm. Then the journal's header notes that the database
-        has the records, `n_drained` counts them, and they leave the queue of the recorder and,
-        except for the newest decisions, the `DecisionIndex`, by which decisions are found in
-        memory. In a product the numbers of their labels are kept for `pop_label_numbers`. Raise
-        StoreError if the database fails; nothing of this is done then, and the next call commits
-        the same records again, of which some may be stored already.
+        The records are committed as they are in memory; that some of them are damaged on disk, or
+        cannot be read there, is noted by an event, which is also logged. Then the journal's header
+        notes that the database has the records, `n_drained` counts them, and they leave the queue
+        of the recorder and, except for the newest decisions, the `DecisionIndex`, by which
+        decisions are found in memory. In a product the numbers of their labels are kept for
+        `pop_label_numbers`. Raise StoreError if the database fails; nothing of this is done then,
+        and the next call commits the same records again, of which some may be stored already.
         """
         with self._changed:
-            chunk = list(islice(self._recorder.synced, DRAIN_CHUNK))
-        records: list[Record] = []
-        n_damaged = 0
-        lost: list[str] = []
-        for entry in chunk:
-            if self._index.is_replaced(entry):
-                continue
-            try:
-                records.append(decode_record(self._journal.read(entry.offset)))
-            except StoreError:
-                n_damaged += 1
-                copy = entry.record or self._index.recent.get(entry.decision_id)
-                if copy is None:
-                    lost.append(entry.decision_id)
-                else:
-                    records.append(copy)
-        numbers = self._store.apply_records(records)
+            chunk = list(islice(self._recorder.synced, CHUNK))
+        entries = [entry for entry in chunk if not self._index.is_replaced(entry)]
+        n_damaged = sum(not self._journal.is_intact(entry.offset) for entry in entries)
+        numbers = self._store.apply_records([entry.record for entry in entries])
         if n_damaged:
             self.report(
-                DATA_LOST if lost else "journal",
+                "journal",
                 f"{n_damaged} records of the journal were damaged on disk and are stored from "
-                f"memory; decisions that are lost: {listed(lost) or 'none'}.",
+                "memory.",
             )
         with self._changed:
             self._journal.drained_to = chunk[-1].end

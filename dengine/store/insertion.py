@@ -4,7 +4,6 @@ lost: one that cannot be stored becomes an event, "dead letter". `SqlStore` has 
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from typing import Any
 
 import sqlalchemy as sa
@@ -28,28 +27,6 @@ from .records import (
     trace_row,
 )
 from .schema import DECISION, EVENT, LABEL, TRACE
-
-
-@dataclass
-class SortedLabels:
-    """Labels of a journal, by what the store does with them.
-
-    Attributes
-    ----------
-    new : dict of str to NewLabel
-        To be inserted, by decision.
-    taken : dict of str to None
-        Decisions that have the label, from now on or since before, in the order of the labels.
-    late_stops : dict of str to None
-        Decisions whose label "confirmed" is to be corrected to a failure (`_is_late_stop`).
-    problems : list of str
-        Labels that contradict what is stored, in words.
-    """
-
-    new: dict[str, NewLabel] = field(default_factory=dict)
-    taken: dict[str, None] = field(default_factory=dict)
-    late_stops: dict[str, None] = field(default_factory=dict)
-    problems: list[str] = field(default_factory=list)
 
 
 class RecordInsertion:
@@ -97,6 +74,8 @@ class RecordInsertion:
         event, unless it is a failure already. Return one pair (decision id, number) for each
         decision that has a label among the records, unless that becomes a dead letter: the number
         of its first label, whether that is new, was stored before, or is corrected by a late stop.
+        A new label keeps a positive number that is still free (`Database.insert`), and is
+        quarantined (kept out of training) if its decision is.
         """
         events = [record for record in records if isinstance(record, Event)]
         decisions = [record for record in records if isinstance(record, StoredDecision)]
@@ -104,12 +83,34 @@ class RecordInsertion:
         problems = self._insert_decisions(connection, decisions)
         ids = [label.decision_id for label in labels]
         stored = self._corrections.stored_labels(connection, ids)
-        sorted_labels = _sort_labels(labels, stored)
-        numbers = self._insert_labels(connection, sorted_labels.new, stored)
-        self._insert_events(connection, events, problems + sorted_labels.problems)
-        for id_ in sorted_labels.late_stops:
+        new: dict[str, NewLabel] = {}
+        labelled: dict[str, None] = {}  # decisions that have the label that is reported
+        late_stops: dict[str, None] = {}
+        for label in labels:
+            id_ = label.decision_id
+            row: Any = stored.get(id_)
+            # The label that the decision has: of these records, or of the store.
+            first = new.get(id_) if row is None or row.seq is None else row
+            problem = _find_problem(label, row, first)
+            if problem:
+                problems.append(problem)
+                continue
+            labelled[id_] = None
+            if first is None:
+                new[id_] = label
+            elif _is_late_stop(label, first) and row.corrected != 0:  # else it is corrected already
+                late_stops[id_] = None
+        rows = [
+            to_row(label) | {"quarantined": stored[label.decision_id].quarantined}
+            for label in new.values()
+        ]
+        numbers = {id_: row.seq for id_, row in stored.items()}
+        new_numbers = self._database.insert(connection, LABEL.c.seq, rows)
+        numbers |= dict(zip(new, new_numbers, strict=True))
+        self._insert_events(connection, events, problems)
+        for id_ in late_stops:
             self._correct_confirmation(connection, id_)
-        return [(id_, numbers[id_]) for id_ in sorted_labels.taken]
+        return [(id_, numbers[id_]) for id_ in labelled]
 
     def _insert_decisions(
         self, connection: sa.Connection, decisions: Sequence[StoredDecision]
@@ -123,40 +124,22 @@ class RecordInsertion:
         query = sa.select(*DECISION.c, *trace_columns).select_from(WITH_TRACES)
         ids = [item.decision.id for item in decisions]
         stored = self._database.rows_by_id(connection, query, ids)
-        new = [item for item in decisions if item.decision.id not in stored]
-        rows = [decision_row(item) for item in new]
-        self._database.insert(connection, DECISION.c.number, rows)
-        if new:
-            cell = {"cell_id": self._database.cell_id}
-            connection.execute(sa.insert(TRACE), [cell | trace_row(item) for item in new])
+        new = []
         problems = []
         for item in decisions:
             row = stored.get(item.decision.id)
-            different = [] if row is None else _differences(item, row)
-            if different:
+            if row is None:
+                new.append(item)
+            elif different := _differences(item, row):
                 names = ", ".join(different)
                 problems.append(
                     f"{_describe(item)}, of which the store holds another: {names} differ"
                 )
+        self._database.insert(connection, DECISION.c.number, [decision_row(item) for item in new])
+        if new:
+            cell = {"cell_id": self._database.cell_id}
+            connection.execute(sa.insert(TRACE), [cell | trace_row(item) for item in new])
         return problems
-
-    def _insert_labels(
-        self, connection: sa.Connection, labels: dict[str, NewLabel], stored: dict[str, Any]
-    ) -> dict[str, int]:
-        """Insert new labels; return their numbers and those of the labels in `stored`, by decision.
-
-        `stored` has a row for each decision of the new labels (`CorrectionTable.stored_labels`),
-        with the number `seq` of the label that it has, or None, and `quarantined`. A label is
-        quarantined (kept out of training) if its decision is. Of a new label with a positive number
-        that is still free the number is kept (`Database.insert`). Nothing is committed.
-        """
-        rows = [
-            to_row(label) | {"quarantined": stored[label.decision_id].quarantined}
-            for label in labels.values()
-        ]
-        numbers = {id_: row.seq for id_, row in stored.items()}
-        new_numbers = self._database.insert(connection, LABEL.c.seq, rows)
-        return numbers | dict(zip(labels, new_numbers, strict=True))
 
     def _insert_events(
         self, connection: sa.Connection, events: Sequence[Event], problems: Sequence[str]
@@ -168,9 +151,10 @@ class RecordInsertion:
         """
         new = []
         if events:
-            query = sa.select(EVENT.c.time, EVENT.c.kind, EVENT.c.text)
             times = [event.time for event in events]
-            query = query.where(self._database.own(EVENT), EVENT.c.time.in_(times))
+            query = sa.select(EVENT.c.time, EVENT.c.kind, EVENT.c.text).where(
+                self._database.own(EVENT), EVENT.c.time.in_(times)
+            )
             stored = {tuple(row) for row in connection.execute(query)}
             new = [event for event in events if (event.time, event.kind, event.text) not in stored]
         for problem in problems:
@@ -189,36 +173,6 @@ class RecordInsertion:
         )
         event = new_event("late stop", text, self._database.clock())
         self._corrections.insert(connection, event, False, {decision_id: True})
-
-
-def _sort_labels(labels: Sequence[NewLabel], stored: dict[str, Any]) -> SortedLabels:
-    """Sort labels by what the store does with them; nothing is written.
-
-    The result holds the labels to be inserted, the decisions that have or will have the label that
-    is reported, those whose label is to be corrected to a failure, and in words the labels that
-    contradict the store. The first label of a decision that has none is new. A second label that
-    repeats success and source of the first changes nothing. A late stop (`_is_late_stop`) corrects
-    the first label; if this was corrected to a failure already, it changes nothing. Any other
-    second label is a problem. So is a late stop whose first label was forgotten, and a label whose
-    decision is not stored with the same content hash and time. `stored` has, by id, what is stored
-    of the decisions and their labels: the rows of `CorrectionTable.stored_labels`.
-    """
-    result = SortedLabels()
-    for label in labels:
-        id_ = label.decision_id
-        row: Any = stored.get(id_)
-        # The label that the decision has: of these records, or of the store.
-        first = result.new.get(id_) if row is None or row.seq is None else row
-        problem = _find_problem(label, row, first)
-        if problem:
-            result.problems.append(problem)
-            continue
-        result.taken[id_] = None
-        if first is None:
-            result.new[id_] = label
-        elif _is_late_stop(label, first) and row.corrected != 0:  # else it is corrected already
-            result.late_stops[id_] = None
-    return result
 
 
 def _find_problem(label: NewLabel, row: Any, first: Any) -> str:

@@ -26,14 +26,12 @@ import struct
 import sys
 import threading
 import urllib.parse
-import urllib.request
 import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from hashlib import blake2b
-from io import FileIO
 from pathlib import Path
 from typing import Any
 
@@ -41,11 +39,11 @@ from ..errors import StoreError, instead
 from ..records import Decision
 from .owned_file import OwnedFile, open_plain, sync
 from .records import (
-    OF_DECISION,
     EntryName,
     Event,
     NewLabel,
     StoredDecision,
+    decision_row,
     from_row,
     pack,
     to_row,
@@ -79,7 +77,7 @@ def encode_record(record: Record) -> bytes:
     length, checksum and digest that stand before each record in a journal are not included.
     """
     if isinstance(record, StoredDecision):
-        row = to_row(record.decision) | to_row(record, *OF_DECISION) | {"shape": record.trace.shape}
+        row = decision_row(record) | {"shape": record.trace.shape}
         samples = pack(record.trace)
     else:
         row = to_row(record)
@@ -91,13 +89,12 @@ def encode_record(record: Record) -> bytes:
 def decode_record(blob: bytes) -> Record:
     """Return the record that `encode_record` wrote; raise StoreError for bytes that have no record.
 
-    A changed number or sample is not noticed here; `Journal.read` checks for that.
+    A changed number or sample is not noticed here; the journal checks for that.
     """
-    errors = (struct.error, ValueError, KeyError, TypeError, AttributeError)
     with instead(
         StoreError,
         "Expected a record of a journal, got what cannot be read",
-        *errors,
+        *(struct.error, *DAMAGES),
         do="open the store with the dengine that wrote it",
     ):
         (length,) = LENGTH.unpack_from(blob)
@@ -160,9 +157,6 @@ class Journal:
     entries : list of (int, str)
         Number and digest of the ledger entries that header and head named at the opening: two, or
         fewer if one of them is missing, new or damaged.
-    dropped : int
-        Bytes of an unfinished record at the end, left by a killed process and cut off. That record
-        was never acknowledged.
     loss : str
         Which acknowledged records are missing or not as they were written, in words; "" if none is.
         The others are read all the same.
@@ -178,11 +172,9 @@ class Journal:
         self.path = path
         self.drained_to = HEADER
         self.end = HEADER
-        self.dropped = 0
         self.loss = ""
         self.head = read_head(path)
         self.entries: list[EntryName] = []
-        self._head_file: FileIO | None = None  # opened when it is written first
         # Guards what header and head hold: two threads write them.
         self._describing = threading.RLock()
         self._owning = owning
@@ -219,7 +211,7 @@ class Journal:
         Returns
         -------
         list of int
-            The offset of each record in bytes, for `read`.
+            The offset of each record in bytes, for `is_intact`.
 
         Raises
         ------
@@ -260,20 +252,14 @@ class Journal:
         with suppress(OSError), os.fdopen(open_plain(head, os.O_WRONLY), "wb") as file:
             sync(file.fileno())
 
-    def read(self, offset: int) -> bytes:
-        """Return the encoded record at an offset that `append` returned.
+    def is_intact(self, offset: int) -> bool:
+        """Return whether a record, whose CRC-32 fits, begins at an offset that `append` returned.
 
-        `decode_record` decodes it. Raise StoreError if no intact record, one whose CRC-32 fits,
-        begins there, or if the disk cannot be read.
+        False, too, if the disk cannot be read.
         """
-        with _os_errors(self.path):
-            record = self._read_record(offset)
-        if record is None:
-            raise StoreError(
-                f"Expected the record that was written to {self.path} at byte {offset}, found "
-                "another."
-            )
-        return record
+        with suppress(OSError):
+            return self._read_record(offset) is not None
+        return False
 
     def undrained_records(self) -> Iterator[tuple[int, int, bytes]]:
         """Yield (offset, end, encoded record) of the records that the store lacks, oldest first.
@@ -296,6 +282,22 @@ class Journal:
                 return
             begin += 1 + (mark if mark >= 0 else len(block) - len(MARK))
 
+    def decode_undrained(self) -> list[Record]:
+        """Return the records that the store lacks, oldest first, without those that are replaced.
+
+        If several decisions have one id, the last replaces the others. Damaged records are left
+        out; the attribute `loss` says so. Raise StoreError for an intact record that cannot be
+        decoded, like that of another release of dengine, and OSError if the disk cannot be read.
+        """
+        records = [decode_record(blob) for _, _, blob in self.undrained_records()]
+        decisions = [record for record in records if isinstance(record, StoredDecision)]
+        last = {item.decision.id: item for item in decisions}
+        return [
+            record
+            for record in records
+            if not isinstance(record, StoredDecision) or last[record.decision.id] is record
+        ]
+
     def save_newest_entry(self, newest: EntryName | None) -> None:
         """Write to header and head the newest ledger entry, and which records the store holds.
 
@@ -313,16 +315,13 @@ class Journal:
     def _write_head(self) -> None:
         """Write the attribute `head` to the small file beside the journal, without a sync.
 
-        The file is created if need be, and stays open. A failure is ignored. The caller holds
-        `_describing`.
+        The file is created if need be. A failure is ignored: an older head is harmless. The caller
+        holds `_describing`.
         """
-        # An older head is harmless. The file stays open, since each report writes it.
-        with suppress(OSError, ValueError):  # ValueError: closed by another thread meanwhile
-            if self._head_file is None:
-                descriptor = open_plain(head_path(self.path), os.O_WRONLY | os.O_CREAT)
-                self._head_file = os.fdopen(descriptor, "wb", buffering=0)
-            self._head_file.seek(0)
-            self._head_file.write(_pack_fields(vars(self.head)).ljust(HEADER))
+        with suppress(OSError):
+            descriptor = open_plain(head_path(self.path), os.O_WRONLY | os.O_CREAT)
+            with os.fdopen(descriptor, "wb") as file:
+                file.write(_pack_fields(vars(self.head)).ljust(HEADER))
 
     def clear(self) -> None:
         """Remove all records; the caller has made sure that the store holds them.
@@ -386,9 +385,6 @@ class Journal:
                     self._file.sync()  # the header, or a disk might keep the cut without it
                     self.end = HEADER
                 self._file.truncate(self.end)
-        if self._head_file is not None:
-            self._head_file.close()
-            self._head_file = None
         self._file.close()
 
     def _write_header(self) -> None:
@@ -417,8 +413,8 @@ class Journal:
         """Read header, head and all records that the store lacks; set the journal's attributes.
 
         With a damaged header the store counts as lacking every record. Records that are damaged or
-        missing are described in `loss`, and the bytes of an unfinished record counted in `dropped`;
-        they are not raised. Nothing is written. Raise StoreError if the file is no journal, and
+        missing are described in `loss`, and not raised. An unfinished record at the end is left
+        out. Nothing is written. Raise StoreError if the file is no journal, and
         OSError if it cannot be read. An empty file is a journal without records.
         """
         head = self.head
@@ -448,9 +444,7 @@ class Journal:
             damaged += offset > begin or not follows
             digests.append(digest)
             begin = end
-        rest = self._file.read(self.end - begin, begin)
-        self.end = begin
-        self.dropped = len(rest.rstrip(b"\0"))
+        self.end = begin  # behind it is at most a record that was never acknowledged
         n_drained = fields["n_drained"]
         n_known = n_drained + len(set(digests))  # a record may be there twice
         is_newest_missing = n_known < head.n_synced or bytes.fromhex(head.digest) not in digests
@@ -553,15 +547,11 @@ def journal_path(url: Any, cell_id: str) -> Path:
 
 
 def sqlite_file(url: Any) -> Path:
-    """Return the path of the file of an SQLite URL or `file:` URI, absolute, links resolved.
+    """Return the path of the file of an SQLite URL, absolute, links resolved.
 
     So one file has one path, and one owner, whatever name it was opened by.
     """
-    database = str(url.database)
-    is_uri = database.startswith("file:")
-    return Path(
-        urllib.request.url2pathname(urllib.parse.urlsplit(database).path) if is_uri else database
-    ).resolve()
+    return Path(str(url.database)).resolve()
 
 
 def head_path(journal: Path) -> Path:
@@ -572,24 +562,16 @@ def head_path(journal: Path) -> Path:
 def read_undrained(path: Path) -> tuple[list[Record], Journal]:
     """Return the records of a journal that its store has not taken, and the journal, closed.
 
-    The records are oldest first. If several decisions have one id, only the last is returned.
-    Damaged records are left out; the journal's attribute `loss` says so. Nothing is locked or
-    changed, so an engine may be using the journal. Raise StoreError if the file cannot be opened or
+    The records are those of `Journal.decode_undrained`. Nothing is locked or changed, so an engine
+    may be using the journal. Raise StoreError if the file cannot be opened or
     is no journal, and for an intact record that cannot be decoded, like that of another release of
     dengine. If the disk fails later, while the records are read, OSError is raised.
     """
     journal = Journal(path, owning=False)
     try:
-        records = [decode_record(blob) for _, _, blob in journal.undrained_records()]
+        return journal.decode_undrained(), journal
     finally:
         journal.close()
-    last = {record.decision.id: record for record in records if isinstance(record, StoredDecision)}
-    newest = [
-        record
-        for record in records
-        if not isinstance(record, StoredDecision) or last[record.decision.id] is record
-    ]
-    return newest, journal
 
 
 def read_head(journal: Path) -> Head:

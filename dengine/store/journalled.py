@@ -12,17 +12,18 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Iterable
 from concurrent.futures import Future
+from contextlib import suppress
 from dataclasses import replace
 from typing import TYPE_CHECKING, TypeVar
 
 from ..errors import NotTakenError, StoreError, log
 from ..records import Arrays, RetrainReport
 from .draining import Drainer
-from .journal import HEADER, decode_record
+from .journal import HEADER
 from .lookup import DecisionIndex
 from .outbox import Outbox
 from .recording import RETRY_SECONDS, Recorder
-from .records import DATA_LOST, LabelNumbers, NewLabel, StoredDecision
+from .records import DATA_LOST, LabelNumbers, NewLabel, StoredDecision, chunks
 from .views import HistoryFilter
 
 if TYPE_CHECKING:
@@ -33,7 +34,6 @@ NO_LIMIT = 1e9  # seconds: never reached
 # Opening waits so long for SQLite's check; that of a large store goes on beside.
 CHECK_SECONDS = 0.1
 CLOSE_SECONDS = 5.0  # the longest that closing waits
-MAX_UNWRITTEN = 10_000  # records in memory while the disk hangs; later decisions are not recorded
 
 
 class JournalledStore(Outbox):
@@ -64,7 +64,7 @@ class JournalledStore(Outbox):
         super().__init__(store, window, NO_LIMIT if patient else store.wait)
         self._unrecorded: set[str] = set()  # ids that were answered without recording a decision
         journal = self._journal = store.claim_cell()
-        self._index = DecisionIndex(journal)
+        self._index = DecisionIndex()
         self._recorder = Recorder(journal, store.clock, self.limit)
         self._changed = self._recorder.changed  # guards all of it
         self._drainer = Drainer(store, journal, self._recorder, self._index, self.limit)
@@ -78,7 +78,6 @@ class JournalledStore(Outbox):
         except BaseException:
             journal.close()
             raise
-        self._drainer.pop_label_numbers()  # an engine that resumes reads these labels
         self._recorder.start(kept=store)
         # Only now: a check of the pages that takes long uses the store as well, and needs them.
         self._drainer.start()
@@ -115,29 +114,17 @@ class JournalledStore(Outbox):
         """Copy to the database what an earlier process left in the journal, and clear the journal.
 
         If records are damaged or missing in the journal, an event DATA_LOST is stored, which is an
-        alarm until a person acknowledges it. Otherwise, if a killed process left an unfinished
-        record, which was cut off, an event that is no alarm says so. Either is logged as an error.
-        Raise StoreError if the database fails, or another release wrote a record, and OSError if
-        the journal cannot be read; the records that were not copied then stay in the journal.
+        alarm until a person acknowledges it, and an error is logged. Raise StoreError if the
+        database fails, or another release wrote a record, and OSError if the journal cannot be
+        read; the records that were not copied then stay in the journal.
         """
-        newest = self.store.decisions.select(HistoryFilter(), limit=1)
-        since = "".join(
-            f" They came after decision {item.decision.id} of {item.when:%F %T} UTC."
-            for item in newest
-        )
-        for offset, end, blob in self._journal.undrained_records():
-            record = decode_record(blob)
-            self._index.add(record, self._recorder.adopt(record, offset, end))
-        while not self.is_drained:
-            self._drainer.drain_chunk()
+        since = ""
+        for item in self.store.decisions.select(HistoryFilter(), limit=1):
+            since = f" They came after decision {item.decision.id} of {item.when:%F %T} UTC."
+        for records in chunks(self._journal.decode_undrained()):
+            self.store.apply_records(records)
         if self._journal.loss:
             self._drainer.report(DATA_LOST, self._journal.loss + since)
-        elif self._journal.dropped:
-            self._drainer.report(
-                "journal",
-                f"{self._journal.dropped} bytes at its end were dropped: a process was killed as "
-                "it wrote them",
-            )
         self._journal.clear()
 
     def _begin_check(self) -> None:
@@ -178,9 +165,8 @@ class JournalledStore(Outbox):
         """Record a decision in memory, return a copy with its number; a thread writes it to disk.
 
         The number is the cell's next one. If its id has a decision in memory, that decision is
-        returned, and nothing is recorded. If 10,000 records wait for the disk, nothing is recorded
-        either: `item` is returned unchanged, and `find_decision` raises StoreError for its id until
-        a decision is recorded for it. That a new id has no decision in the database is not checked.
+        returned, and nothing is recorded. That a new id has no decision in the database is not
+        checked.
         """
         id_ = item.decision.id
         with self._changed:
@@ -188,12 +174,9 @@ class JournalledStore(Outbox):
             if first is not None:
                 return first
             self._unrecorded.discard(id_)
-            if len(self._recorder.unwritten) >= MAX_UNWRITTEN:
-                self._unrecorded.add(id_)
-                return item
             self.n_decisions += 1
             item = replace(item, number=self.n_decisions)
-            self._index.add(item, self._recorder.record(item))
+            self._index.add(self._recorder.record(item))
         return item
 
     def replace_decision(self, item: StoredDecision) -> StoredDecision:
@@ -201,9 +184,7 @@ class JournalledStore(Outbox):
 
         Both have the same id. What is recorded and returned is a copy of `item` with time, trace
         and row number of the earlier decision. If the earlier one is on disk by now, nothing is
-        recorded, and the earlier one is returned. Raise KeyError for an id that is neither in
-        memory nor in the journal, and StoreError if the journal is damaged where the earlier
-        decision stands, or cannot be read.
+        recorded, and the earlier one is returned. Raise KeyError for an id that is not in memory.
         """
         id_ = item.decision.id
         with self._changed:
@@ -213,7 +194,7 @@ class JournalledStore(Outbox):
             if not self._index.is_unsynced(id_):
                 return first
             item = replace(item, time=first.time, trace=first.trace, number=first.number)
-            self._index.add(item, self._recorder.record(item))
+            self._index.add(self._recorder.record(item))
         return item
 
     def record_labels(self, labels: Iterable[tuple[StoredDecision, NewLabel]]) -> None:
@@ -224,8 +205,7 @@ class JournalledStore(Outbox):
         """
         with self._changed:
             for item, label in labels:
-                label = self._completed(item, label)
-                self._index.add(label, self._recorder.record(label))
+                self._index.add(self._recorder.record(self._completed(item, label)))
 
     def record_event(self, kind: str, text: str) -> None:
         self._recorder.record_event(kind, text)
@@ -252,13 +232,13 @@ class JournalledStore(Outbox):
     # What the engine asks
 
     def find_decision(self, decision_id: str, unsynced: bool = False) -> StoredDecision | None:
-        """Return a decision with its label from memory, journal or database, or None if unknown.
+        """Return a decision with its label from memory or database, or None if unknown.
 
         A label that is not on disk yet is left out, unless `unsynced` is True. A label from memory
         comes without number and time. Raise StoreError if the database is needed and has a fault or
-        does not answer within `limit` seconds, or if the stored trace, or the journal where the
-        decision stands, is damaged or cannot be read. Raise it also for an id whose last decision
-        was not recorded, because the id could not be looked up or the disk hung.
+        does not answer within `limit` seconds, or if the stored trace is damaged or cannot be read.
+        Raise it also for an id whose last decision was not recorded, because the id could not be
+        looked up.
         """
         with self._changed:
             if decision_id in self._unrecorded:
@@ -290,9 +270,9 @@ class JournalledStore(Outbox):
             raise
 
     def load_ids(self) -> None:
-        """Read the ids of all decisions from the database into a Bloom filter in memory.
+        """Read the ids of all decisions from the database, and keep their hashes in memory.
 
-        By the filter most new ids are recognized without the database. It takes about a second for
+        By these a new id is recognized without the database. It takes about a second for
         a million ids, without a time limit; other calls to this outbox may go on meanwhile. Once
         all are loaded, another call does nothing. Raise StoreError if the database cannot be read.
         """
@@ -309,9 +289,10 @@ class JournalledStore(Outbox):
         It ends when that succeeds or the outbox is closed. Until then each id that is not in memory
         is looked up in the database.
         """
-        while not self._closed and not self._index.has_all_ids:
+        while not self._closed:
             try:
                 self.load_ids()
+                return
             except StoreError:
                 with self._changed:
                     self._changed.wait_for(lambda: self._closed, RETRY_SECONDS)
@@ -349,36 +330,21 @@ class JournalledStore(Outbox):
             log.error("closed without the newest records, which no report acknowledged: %s", error)
         # A sync that is under way hangs: nothing that waits for the disk would end.
         seconds = 0.0 if self._recorder.is_syncing else CLOSE_SECONDS
-        self._drainer.wait_for_store(seconds)
-        if self._end_threads(seconds) and self.is_drained:
-            self.store.close()
-        else:
-            self._leave_store(can_close=seconds > 0.0)
-
-    def _end_threads(self, seconds: float) -> bool:
-        """Mark this as closed; end the thread that writes the journal, then the one that drains it.
-
-        To drain is to copy the journal's records into the database. Each thread first tries once to
-        write the records that wait for it. Return whether both have ended, each within these
-        seconds.
-        """
+        with suppress(StoreError):
+            self._drainer.drain(seconds)
         with self._changed:
             self._closed = True
+        # Each thread first tries once to write the records that wait for it.
         has_recorder_ended = self._recorder.stop(seconds)
-        return self._drainer.stop(seconds) and has_recorder_ended
-
-    def _leave_store(self, can_close: bool) -> None:
-        """Log that the journal holds records that the database lacks, and why.
-
-        If `can_close` (the disk answers), disconnect and close the journal without waiting, so that
-        another engine can own the cell; a lease on a server ends when its connection is closed. If
-        not, both stay open until the process ends.
-        """
+        if self._drainer.stop(seconds) and has_recorder_ended and self.is_drained:
+            self.store.close()
+            return
         log.warning(
             "the store was left, its journal %s holds what it lacks: %s",
             self._journal.path,
             self.fault,
         )
-        if can_close:
+        if seconds:  # else the disk hangs: both stay open until the process ends
+            # Another engine can own the cell; a lease ends when its connection is closed.
             self.store.database.close(waiting=False)
             self._journal.close(waiting=False)

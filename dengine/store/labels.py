@@ -3,14 +3,14 @@ and as outcomes for a decision rule. `SqlStore` has one.
 """
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
 import sqlalchemy as sa
 
 from ..errors import StoreError, listed
-from ..records import Reason, Source, TraceArray
+from ..records import Reason, Source
 from .cell_table import CellTable
 from .connections import Database
 from .decisions import DecisionTable
@@ -18,18 +18,17 @@ from .events import EventTable
 from .ledger import is_intact
 from .queries import (
     LABEL_OF_DECISION,
+    TRACE_OF_LABEL,
     TRAINS,
     Scope,
     audit_columns,
     corrected_label,
-    training_query,
 )
 from .records import (
     CHUNK,
     FORGOTTEN,
     LabelledTraces,
     OutcomeRecord,
-    StoredDecision,
     from_row,
     overdue_outcomes,
     unpack,
@@ -99,18 +98,46 @@ class LabelTable(CellTable):
             is not noticed here. If the database fails.
         """
         scope = Scope(self._database.cell_id) if cell_only else self._scope
-        query = training_query(scope, corrected_to).order_by(LABEL.c.seq.desc()).limit(limit)
-        query = query if first <= 1 else query.where(LABEL.c.seq >= int(first))
+        label = corrected_label(corrected_to)
+        columns = (LABEL.c.seq, label.label("success"), LABEL.c.content_hash)
+        query = (
+            sa.select(*TRACE.c, *columns, LABEL.c.decision_id.label("labelled_id"))
+            .select_from(LABEL.outerjoin(TRACE, TRACE_OF_LABEL))
+            .where(scope.shared(LABEL.c.cell_id), TRAINS, label != FORGOTTEN)
+            .where(LABEL.c.seq >= int(first))
+            .order_by(LABEL.c.seq.desc())
+            .limit(limit)
+        )
         query = query if last is None else query.where(LABEL.c.seq <= last)
+        kept = []
+        traces = []
+        damaged = []
         with self._database.reading() as connection:
-            rows = self._read_newest(connection, query, limit, last)[::-1]
-            labelled, damaged = self._with_traces(connection, rows, scope)
-        self._record_left_out(damaged, "trace")
-        return labelled
+            for row in self._read_newest(connection, query, limit, last):
+                if row.success not in (0, 1):
+                    raise StoreError(
+                        "Expected labels that are True or False, found another: the store is "
+                        "damaged; restore a copy."
+                    )
+                if is_intact(TRACE, row):
+                    kept.append((row.seq, row.success, row.content_hash))
+                    traces.append(unpack(row.data).reshape(row.channels, row.samples))
+                else:
+                    damaged.append(row.labelled_id)
+        self._record_left_out(damaged[::-1], "trace")
+        shapes = sorted({trace.shape for trace in traces})
+        if len(shapes) > 1:
+            raise StoreError(
+                f"Expected one shape in a cell's store, found {shapes}; give each kind its own "
+                "cell_id."
+            )
+        seq, labels, hashes = np.array(kept[::-1], dtype=np.int64).reshape(-1, 3).T.copy()
+        stacked = np.stack(traces[::-1]) if traces else np.zeros((0, 0, 0), np.float32)
+        return LabelledTraces(seq, stacked, labels.astype(np.int8), hashes)
 
     def _read_newest(
         self, connection: sa.Connection, query: sa.Select[Any], limit: int | None, last: int | None
-    ) -> Sequence[Any]:
+    ) -> Iterable[Any]:
         """Run a query for the newest `limit` labels up to number `last`; return rows, newest first.
 
         `query` must have this limit (None: no limit), order and condition already. In a product it
@@ -120,56 +147,12 @@ class LabelTable(CellTable):
         """
         if self._scope.product is not None and limit is not None:
             newest = self._scope.newest(connection, LABEL.c.seq)
-            newest = newest if last is None else min(newest, last)
+            newest = min(newest, last or newest)
             rows = connection.execute(query.where(LABEL.c.seq > newest - 2 * limit)).all()
             if len(rows) == limit or newest <= 2 * limit:
                 return rows
-        return connection.execute(query).all()  # here more than half are quarantined or forgotten
-
-    def _with_traces(
-        self, connection: sa.Connection, rows: Sequence[Any], scope: Scope
-    ) -> tuple[LabelledTraces, list[str]]:
-        """Read the traces of label rows, which are sorted by number, oldest first.
-
-        `scope` is the cell, or the cell with its product, whose labels the rows are. Return the
-        labelled traces in this order, and the ids of decisions whose traces are missing or not as
-        they were stored; these are left out. Raise StoreError if traces have different shapes, or a
-        label is not 0 or 1.
-        """
-        labels = {row.seq: row for row in rows}  # the forgotten are not among them
-        traces: dict[int, TraceArray] = {}
-        is_of_label = (TRACE.c.cell_id == LABEL.c.cell_id) & (
-            TRACE.c.decision_id == LABEL.c.decision_id
-        )
-        query = (
-            sa.select(*TRACE.c, LABEL.c.seq)
-            .select_from(LABEL.join(TRACE, is_of_label))
-            .where(scope.shared(LABEL.c.cell_id), TRAINS)
-        )
-        first, last = (rows[0].seq, rows[-1].seq) if rows else (1, 0)
-        query = query.where(LABEL.c.seq.between(first, last)).order_by(LABEL.c.seq)
-        for row in connection.execute(query.execution_options(yield_per=CHUNK)):
-            if row.seq in labels and is_intact(TRACE, row):
-                traces[row.seq] = unpack(row.data).reshape(row.channels, row.samples)
-        shapes = sorted({trace.shape for trace in traces.values()})
-        if len(shapes) > 1:
-            raise StoreError(
-                f"Expected one shape in a cell's store, found {shapes}; give each kind its own "
-                "cell_id."
-            )
-        if not all(row.success in (0, 1) for row in rows):
-            raise StoreError(
-                "Expected labels that are True or False, found another: the store is damaged; "
-                "restore a copy."
-            )
-        kept = [labels[seq] for seq in traces]
-        labelled = LabelledTraces(
-            seq=np.array([row.seq for row in kept], dtype=np.int64),
-            traces=np.stack([*traces.values()]) if traces else np.zeros((0, 0, 0), np.float32),
-            labels=np.array([row.success for row in kept], dtype=np.int8),
-            hashes=np.array([row.content_hash for row in kept], dtype=np.int64),
-        )
-        return labelled, [row.decision_id for row in rows if row.seq not in traces]
+        # In a product: here more than half are quarantined or forgotten.
+        return connection.execute(query.execution_options(yield_per=CHUNK))
 
     def past(self, after: int, upto: int | None = None) -> list[PastLabel]:
         """Return this cell's labels as they were recorded, oldest first.
@@ -205,8 +188,11 @@ class LabelTable(CellTable):
         rows = self._read(query if upto is None else query.where(LABEL.c.seq <= upto))
         damaged = {row.decision_id for row in rows if not is_intact(LABEL, row)}
         self._record_left_out(sorted(damaged), "label")
-        rows = [row for row in rows if row.decision_id not in damaged]
-        return [from_row(PastLabel, row._mapping, novel=row.reason == Reason.NOVEL) for row in rows]
+        return [
+            from_row(PastLabel, row._mapping, novel=row.reason == Reason.NOVEL)
+            for row in rows
+            if row.decision_id not in damaged
+        ]
 
     def outcomes_since(
         self, seq: int, since_version: int = 0, overdue_to: int = 0
@@ -263,10 +249,8 @@ class LabelTable(CellTable):
             )
             .order_by(LABEL.c.seq)
         )
-        overdue: deque[StoredDecision] = deque()
-        if overdue_to:
-            pending = self._decisions.pending(since_version)
-            overdue.extend(item for item in pending if item.number <= overdue_to)
+        pending = self._decisions.pending(since_version) if overdue_to else []
+        overdue = deque(item for item in pending if item.number <= overdue_to)
         outcomes: list[OutcomeRecord] = []
         for *values, last_overdue in rows:
             while overdue and overdue[0].number <= last_overdue:
@@ -292,13 +276,10 @@ class LabelTable(CellTable):
         -------
         int
         """
-        return int(
-            self._read(
-                sa.select(sa.func.coalesce(sa.func.sum(LABEL.c.silent), 0)).where(
-                    self._own(LABEL), TRAINS, LABEL.c.model_version >= since_version
-                )
-            )[0][0]
+        query = sa.select(sa.func.sum(LABEL.c.silent)).where(
+            self._own(LABEL), TRAINS, LABEL.c.model_version >= since_version
         )
+        return int(self._read(query)[0][0] or 0)
 
     def _record_left_out(self, damaged: Sequence[str], part: str) -> None:
         """Write an event to the store that says that some traces or labels were left out.

@@ -36,7 +36,18 @@ import sqlalchemy as sa
 from ..errors import StoreError
 from ..files import read_key
 from .records import Clock, EntryName, Row
-from .schema import CHAINED, CORRECTION, LABEL, LEDGER, LEDGER_KEY, RESERVED, SETTING, VERSION
+from .schema import (
+    CHAINED,
+    CORRECTION,
+    LABEL,
+    LEDGER,
+    LEDGER_KEY,
+    SETTING,
+    VERSION,
+    insert_settings,
+    read_setting,
+    read_settings,
+)
 
 KEY_VARIABLE = "DENGINE_LEDGER_KEY"  # of the environment: the file of the key of all ledgers
 # The column by which the rows of each table that an engine reads are numbered.
@@ -153,12 +164,9 @@ def check_key(connection: sa.Connection, cell_id: str, key: bytes, begin: bool =
         a key counts as begun without a key.
     """
     tag = hmac.new(key, b"dengine ledger", "sha256").hexdigest() if key else None
-    is_tag = (SETTING.c.cell_id == cell_id) & (SETTING.c.key == LEDGER_KEY)
-    stored = connection.execute(sa.select(SETTING.c.value).where(is_tag)).scalar()
+    stored = read_setting(connection, cell_id, LEDGER_KEY)
     if begin and stored is None and tag and newest_entry(connection, cell_id) is None:
-        connection.execute(
-            sa.insert(SETTING), {"cell_id": cell_id, "key": LEDGER_KEY, "value": tag}
-        )
+        insert_settings(connection, cell_id, {LEDGER_KEY: tag})
     elif stored != tag:
         begun = "with another key"
         if stored is None:
@@ -228,16 +236,18 @@ def _extend_chain(chained: str, sums: Iterable[bytes]) -> str:
     return hashlib.sha256(chained.encode() + b"".join(sorted(sums))).hexdigest()
 
 
-def _settings_chain(settings: Mapping[str, str]) -> str:
-    """Return a SHA-256 over a cell's settings, hexadecimal; their order does not matter."""
-    return _extend_chain("", [json.dumps(settings, sort_keys=True).encode()])
+def _settings_chain(settings: str) -> str:
+    """Return a SHA-256 over a cell's settings, hexadecimal; `settings` is their JSON, sorted."""
+    return _extend_chain("", [settings.encode()])
 
 
-def _parse_chains(text: str) -> dict[str, str]:
-    """Return the chain of each table, hexadecimal, by name, from an entry's column `chains`.
+def _settings_text(connection: sa.Connection, cell_id: str) -> str:
+    """Return a cell's settings, without those that the store itself keeps, as JSON, sorted."""
+    return json.dumps(read_settings(connection, cell_id), sort_keys=True)
 
-    {} if that is damaged; no rows fit it then.
-    """
+
+def parse_object(text: Any) -> dict[str, Any]:
+    """Return the fields of a JSON object that a ledger entry holds; {} if it is damaged or None."""
     with suppress(ValueError, TypeError):
         return dict(json.loads(text))
     return {}
@@ -265,9 +275,13 @@ class LedgerEntry:
         self._cell_id = cell_id
         self._key = key
         last = newest_entry(connection, cell_id)
-        self._number: int = 1 if last is None else last.number + 1
-        self._previous: bytes = START if last is None else last.digest
-        self._chains = {} if last is None else _parse_chains(last.chains)
+        self._number = 1
+        self._previous = START
+        self._chains: dict[str, str] = {}
+        if last is not None:
+            self._number = last.number + 1
+            self._previous = last.digest
+            self._chains = parse_object(last.chains)
         self._sums: dict[str, list[bytes]] = {}
         self.settings = False
 
@@ -305,7 +319,7 @@ class LedgerEntry:
                 chains[name] = _extend_chain(chains.get(name, ""), self._sums[name])
         settings = None
         if self.settings:
-            settings = read_settings(self._connection, self._cell_id)
+            settings = _settings_text(self._connection, self._cell_id)
             chains[SETTING.name] = _settings_chain(settings)
         head = {
             "cell_id": self._cell_id,
@@ -314,46 +328,11 @@ class LedgerEntry:
             "added": json.dumps({table: len(sums) for table, sums in sorted(self._sums.items())}),
             "rows": rows_digest(self._sums),
             "chains": json.dumps(chains, sort_keys=True),
-            "settings": None if settings is None else json.dumps(settings, sort_keys=True),
+            "settings": settings,
         }
         digest = entry_digest(self._previous, head, self._key)
         self._connection.execute(sa.insert(LEDGER), head | {"digest": digest})
         return self._number, digest.hex()
-
-
-def read_settings(connection: sa.Connection, cell_id: str) -> dict[str, str]:
-    """Return a cell's settings, by key, without those that the store itself keeps (`RESERVED`).
-
-    {} for an unknown cell.
-    """
-    query = sa.select(SETTING.c.key, SETTING.c.value).where(
-        SETTING.c.cell_id == cell_id, SETTING.c.key.not_in(RESERVED)
-    )
-    return {row.key: row.value for row in connection.execute(query)}
-
-
-def find_settings_faults(connection: sa.Connection, cell_id: str) -> dict[str, str]:
-    """Compare a cell's settings with the newest copy of them in the ledger.
-
-    Return a text for each key that differs: "is not chained" if only the store has it, "is missing"
-    if only the ledger has it, else "was changed". {} if all are equal. A damaged or missing copy
-    counts as empty. The settings of the store itself (`RESERVED`) are not compared.
-    """
-    stored = read_settings(connection, cell_id)
-    chained: dict[str, str] = {}
-    is_copy = (LEDGER.c.cell_id == cell_id) & LEDGER.c.settings.is_not(None)
-    newest = sa.select(LEDGER.c.settings).where(is_copy).order_by(LEDGER.c.number.desc()).limit(1)
-    with suppress(ValueError, TypeError):  # an entry that was changed is found by the chain
-        chained = dict(json.loads(connection.execute(newest).scalar() or "{}"))
-    faults = {}
-    for key in sorted(stored.keys() | chained.keys(), key=str):
-        if key not in chained:
-            faults[key] = "is not chained"
-        elif key not in stored:
-            faults[key] = "is missing"
-        elif stored[key] != chained[key]:
-            faults[key] = "was changed"
-    return faults
 
 
 def find_integrity_error(connection: sa.Connection, cell_id: str, key: bytes, first: int) -> str:
@@ -391,9 +370,9 @@ def find_integrity_error(connection: sa.Connection, cell_id: str, key: bytes, fi
     previous = before.get("digest", START)
     if newest and entry_digest(previous, newest | {"digest": None}, key) != newest["digest"]:
         return "the newest entry of the ledger is not as it was written"
-    chains = _parse_chains(newest.get("chains", ""))
-    settings = _settings_chain(read_settings(connection, cell_id))
-    if chains.get(SETTING.name, _settings_chain({})) != settings:
+    chains = parse_object(newest.get("chains"))
+    settings = _settings_chain(_settings_text(connection, cell_id))
+    if chains.get(SETTING.name, _settings_chain("{}")) != settings:
         return "the settings are not those of the ledger"
     last_entry = newest.get("number", 0)
     for name in IN_FORCE:
@@ -438,7 +417,7 @@ def _find_table_error(
     if before is not None:
         is_entry = (LEDGER.c.cell_id == cell_id) & (LEDGER.c.number == before.entry)
         text = connection.execute(sa.select(LEDGER.c.chains).where(is_entry)).scalar()
-        chain = _parse_chains(text or "").get(name, "")
+        chain = parse_object(text).get(name, "")
         selected = selected & (number > before[1])
     selected &= table.c.entry.is_(None) | (table.c.entry <= last_entry)
     rows = connection.execute(
@@ -447,7 +426,7 @@ def _find_table_error(
         .order_by(number)
     )
     for _, group in groupby(rows, lambda row: row.entry):
-        entry_rows = [dict(zip(rows.keys(), row, strict=True)) for row in group]
+        entry_rows = [dict(row._mapping) for row in group]
         if changed := [row for row in entry_rows if row_sum(name, row) != row["sum"]]:
             return f"the {name} {changed[0][number.name]} is not as it was written"
         chain = _extend_chain(chain, [row["sum"] for row in entry_rows])

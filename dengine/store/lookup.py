@@ -1,79 +1,27 @@
 """`DecisionIndex`: the decisions that an engine can look up without its database. It holds the
-newest ones in memory, knows where in the journal the others are that the database lacks, and
-recognizes a new id by a `BloomFilter` over all ids. `JournalledStore` has one.
+newest ones and those that the database lacks, and recognizes a new id by the hashes of all ids.
+`JournalledStore` has one.
 """
 
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Iterable, Sequence
-from hashlib import blake2b
+from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
-from .journal import Journal, Record, decode_record
 from .recording import Entry
 from .records import NewLabel, StoredDecision
 
 N_RECENT = 1_000  # newest decisions kept in memory
 
 
-class BloomFilter:
-    """A set of decision ids in 2 MB, however many: it may report an id that was never added.
-
-    It never misses an id that was added. At a million ids, one new id in 500 is reported.
-
-    Parameters
-    ----------
-    ids : iterable of str
-        The first ids.
-
-    References
-    ----------
-    Bloom (1970), CACM 13(7).
-    """
-
-    def __init__(self, ids: Iterable[str] = ()) -> None:
-        self._bytes = np.zeros(2**21, dtype=np.uint8)
-        self.add(*ids)
-
-    def add(self, *ids: str) -> None:
-        """Add ids."""
-        byte, bit = self._bit_positions(ids)
-        np.bitwise_or.at(self._bytes, byte, bit)
-
-    def may_contain(self, decision_id: str) -> bool:
-        """Return False if the id was never added, True if it was or (rarely) if it was not."""
-        byte, bit = self._bit_positions([decision_id])
-        return bool((self._bytes[byte] & bit).all())
-
-    def _bit_positions(self, ids: Iterable[str]) -> tuple[NDArray[Any], NDArray[Any]]:
-        """Return the four bits of the filter that belong to each id.
-
-        The first array has the index of the byte in which a bit is, the second a byte in which only
-        this bit is set. Both arrays have four entries per id; the second has dtype uint8.
-        """
-        digests = bytearray()
-        for id_ in ids:
-            digests += blake2b(id_.encode("utf-8", "surrogatepass"), digest_size=16).digest()
-        positions = np.frombuffer(digests, dtype="<u4") % (8 * len(self._bytes))
-        return positions >> 3, np.left_shift(1, positions & 7, dtype=np.uint8, casting="unsafe")
-
-
 class DecisionIndex:
-    """Finds decisions and labels by id in memory and in the journal, without the database.
+    """Finds decisions and labels by id in memory, without the database.
 
-    It holds the newest decisions, every record that is not drained, and a Bloom filter of all ids,
-    which tells ids that are certainly new.
+    It holds the newest decisions, every record that is not drained, and the hashes of all ids,
+    which tell ids that are certainly new. A million hashes take about 70 MB of memory.
 
     It has no lock: whoever shares it between threads holds one.
-
-    Parameters
-    ----------
-    journal : Journal
-        From which decisions are read that are not in memory any more.
 
     Attributes
     ----------
@@ -83,82 +31,81 @@ class DecisionIndex:
         Whether all ids of the database were added.
     """
 
-    def __init__(self, journal: Journal) -> None:
-        self._journal = journal
+    def __init__(self) -> None:
         self.recent: OrderedDict[str, StoredDecision] = OrderedDict()
         # Not drained, by decision: the newest record of the decision, and of its label.
         self._decisions: dict[str, Entry] = {}
-        self._labels: dict[str, tuple[NewLabel, Entry]] = {}
-        self._ids = BloomFilter()
+        self._labels: dict[str, Entry] = {}
+        self._hashes: set[int] = set()  # of all ids; they take less memory than the ids
         self.has_all_ids = False
 
-    def add(self, record: Record, entry: Entry) -> None:
+    def add(self, entry: Entry) -> None:
         """Add a record that was just recorded; an event, which has no id, changes nothing.
 
-        `entry` says where the record is, in memory or in the journal. It replaces an earlier
-        decision of that id, or an earlier label of that decision. If there are more than N_RECENT
-        decisions (1,000) in memory, the oldest is dropped from memory.
+        `entry` holds the record. It replaces an earlier decision of that id, or an earlier label of
+        that decision. The oldest of more than N_RECENT decisions (1,000) leaves `recent`.
         """
+        record = entry.record
         if isinstance(record, StoredDecision):
             id_ = record.decision.id
             self.recent[id_] = record
             self._decisions[id_] = entry
-            self._ids.add(id_)
+            self._hashes.add(hash(id_))
             if len(self.recent) > N_RECENT:
                 self.recent.popitem(last=False)
         elif isinstance(record, NewLabel):
-            self._labels[record.decision_id] = record, entry
+            self._labels[record.decision_id] = entry
 
     def is_replaced(self, entry: Entry) -> bool:
         """Return whether a later record of the same decision replaces this undrained one."""
-        return bool(entry.decision_id) and self._decisions.get(entry.decision_id) is not entry
+        record = entry.record
+        return (
+            isinstance(record, StoredDecision)
+            and self._decisions.get(record.decision.id) is not entry
+        )
 
     def remove_drained(self, entry: Entry) -> None:
-        """Remove a record that the database has now, or that is lost.
+        """Remove a record that the database has now.
 
-        `entry` says which record. The newest N_RECENT decisions (1,000) stay in memory. If the
+        `entry` holds the record. The newest N_RECENT decisions (1,000) stay in `recent`. If the
         record is a label, its decision there is replaced by a copy with the label. Raise KeyError
         for a label that was not added.
         """
-        if not self.is_replaced(entry):
-            self._decisions.pop(entry.decision_id, None)
-        label = entry.record
-        if isinstance(label, NewLabel):
-            id_ = label.decision_id
-            if self._labels[id_][1] is entry:  # else a later label of the decision waits
+        record = entry.record
+        if isinstance(record, StoredDecision) and not self.is_replaced(entry):
+            del self._decisions[record.decision.id]
+        elif isinstance(record, NewLabel):
+            id_ = record.decision_id
+            if self._labels[id_] is entry:  # else a later label of the decision waits
                 del self._labels[id_]
             item = self.recent.get(id_)
             if item is not None:
-                self.recent[id_] = item.with_label(label)
+                self.recent[id_] = item.with_label(record)
 
     def find(
         self, decision_id: str, unsynced: bool = False
     ) -> tuple[StoredDecision | None, NewLabel | None]:
-        """Return a decision and its label, as far as they are in memory or in the journal.
+        """Return a decision and its label, as far as they are in memory.
 
         Returns
         -------
         decision : StoredDecision or None
-            From the newest N_RECENT decisions (1,000) in memory, or, if the database lacks it, from
-            the records that wait for the disk or from the journal; otherwise None. Among the newest
-            it has its label, if the database got the label while it was there.
+            One of the newest N_RECENT decisions (1,000), or of those that the database lacks;
+            otherwise None. Among the newest it has its label, if the database got the label while
+            it was there.
         label : NewLabel or None
             The label of the decision, if the database lacks it. None if there is none, or if it is
             not on disk yet and `unsynced` is False.
-
-        Raises
-        ------
-        StoreError
-            If the journal is damaged where the decision stands, or cannot be read.
         """
-        item = self.recent.get(decision_id)
+        item: Any = self.recent.get(decision_id)
         entry = self._decisions.get(decision_id)
         if item is None and entry is not None:
-            record: Any = entry.record or decode_record(self._journal.read(entry.offset))
-            item = record
-        label, place = self._labels.get(decision_id, (None, None))
-        is_counted = unsynced or (place is not None and place.is_synced)
-        return item, label if is_counted else None
+            item = entry.record
+        label: Any = None
+        entry = self._labels.get(decision_id)
+        if entry is not None and (unsynced or entry.is_synced):
+            label = entry.record
+        return item, label
 
     def is_unsynced(self, decision_id: str) -> bool:
         """Return whether a decision was recorded, and is not in the journal yet."""
@@ -175,8 +122,8 @@ class DecisionIndex:
 
         Until all ids are loaded, False for every id.
         """
-        return self.has_all_ids and not self._ids.may_contain(decision_id)
+        return self.has_all_ids and hash(decision_id) not in self._hashes
 
     def add_ids(self, ids: Sequence[str]) -> None:
         """Add ids of decisions that the database has."""
-        self._ids.add(*ids)
+        self._hashes.update(map(hash, ids))

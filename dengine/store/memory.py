@@ -77,10 +77,6 @@ class MemoryStore(Outbox):
         self._decisions[item.decision.id] = item
         return item
 
-    def replace_decision(self, item: StoredDecision) -> StoredDecision:
-        """Raise KeyError: a decision of a store in memory is never late, so none is replaced."""
-        raise KeyError(item.decision.id)
-
     def record_labels(self, labels: Iterable[tuple[StoredDecision, NewLabel]]) -> None:
         """Keep copies of labels in memory; `labels` holds pairs of a decision and its label.
 

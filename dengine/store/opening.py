@@ -67,18 +67,14 @@ def open_store(
 
     if isinstance(store, SqlStore):
         return store
-    is_name = store is None or isinstance(store, str | os.PathLike)
-    expect(is_name, "None, a file, a URL or an SqlStore", store, error=StoreError)
     if store is None:
         return SqlStore()
-    cell_id = "cell"
-    product = None
-    if isinstance(store, CellAddress):
-        cell_id = store.cell_id
-        product = store.product
+    is_name = isinstance(store, str | os.PathLike)
+    expect(is_name, "None, a file, a URL or an SqlStore", store, error=StoreError)
+    url = store if isinstance(store, CellAddress) else CellAddress(os.fspath(store), "cell")
     if must_exist:
-        check_cell_exists(os.fspath(store), cell_id)
-    return SqlStore(os.fspath(store), cell_id, product=product, wait=wait)
+        check_cell_exists(url, url.cell_id)
+    return SqlStore(url, url.cell_id, product=url.product, wait=wait)
 
 
 @contextmanager

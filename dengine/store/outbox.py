@@ -155,12 +155,9 @@ class Outbox(ABC):
         -------
         StoredDecision
             A copy of `item` with its number. If the id already has a decision in memory, that
-            decision is returned, and nothing is recorded. If the disk hangs and `item` cannot be
-            recorded, it is returned as it came, with number 0; `find_decision` then raises
-            StoreError for its id.
+            decision is returned, and nothing is recorded.
         """
 
-    @abstractmethod
     def replace_decision(self, item: StoredDecision) -> StoredDecision:
         """Replace a recorded decision that was not returned to the caller yet, under the same id.
 
@@ -175,8 +172,10 @@ class Outbox(ABC):
         Raises
         ------
         KeyError
-            If no decision with this id is in memory or in the journal.
+            If no decision with this id is in memory. Always for a store in memory, of which no
+            decision is late.
         """
+        raise KeyError(item.decision.id)
 
     def number_label(self) -> int:
         """Return the next number for a new label; each call uses up a number.
@@ -292,7 +291,7 @@ class Outbox(ABC):
 
     @abstractmethod
     def find_decision(self, decision_id: str, unsynced: bool = False) -> StoredDecision | None:
-        """Return a decision with its label, from memory, the journal or the database.
+        """Return a decision with its label, from memory or the database.
 
         A decision is found as soon as it is recorded. The database is asked only if the id may be
         there, and only for `limit` seconds.
@@ -313,8 +312,7 @@ class Outbox(ABC):
         ------
         StoreError
             If the database is needed and unavailable, and if the stored trace is damaged. Also if
-            the last decision for this id was not recorded, because the disk hung or the id could
-            not be looked up.
+            the last decision for this id was not recorded, because the id could not be looked up.
         """
 
     def find_earlier(self, decision_id: str) -> StoredDecision | None:

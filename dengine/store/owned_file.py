@@ -23,34 +23,26 @@ def _lock_of_system() -> Callable[[int], object]:
 
     The function does not wait: it raises BlockingIOError if another descriptor has the lock, and
     otherwise the OSError of the system, for example if the file system has no locks. The lock ends
-    when the file is closed or the process ends. The function is `flock`, or on Windows that of
-    `_lock_of_windows`.
+    when the file is closed or the process ends. It is `flock`. On Windows it is that of one byte
+    far behind the content, to which the function moves the offset of the file.
     """
     try:
         import fcntl
     except ImportError:
         import msvcrt
 
-        return _lock_of_windows(msvcrt)
+        windows: Any = msvcrt  # of which a type checker on another system knows nothing
+
+        def lock_byte(descriptor: int) -> None:
+            """Lock one byte of the file without waiting; BlockingIOError if it is locked."""
+            os.lseek(descriptor, LOCKED_BYTE, os.SEEK_SET)
+            try:
+                windows.locking(descriptor, windows.LK_NBLCK, 1)
+            except PermissionError as error:  # as it says that the byte is locked
+                raise BlockingIOError(errno.EAGAIN, os.strerror(errno.EAGAIN)) from error
+
+        return lock_byte
     return lambda descriptor: fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-
-
-def _lock_of_windows(msvcrt: Any) -> Callable[[int], object]:
-    """Return a function that locks an open file, given by its descriptor, on Windows.
-
-    `msvcrt` is Python's module of that name. The function locks one byte far behind the content,
-    and moves the offset of the file there. It raises BlockingIOError if the byte is locked already.
-    """
-
-    def lock(descriptor: int) -> None:
-        """Lock one byte of the file without waiting; BlockingIOError if it is locked."""
-        os.lseek(descriptor, LOCKED_BYTE, os.SEEK_SET)
-        try:
-            msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)
-        except PermissionError as error:  # as it says that the byte is locked
-            raise BlockingIOError(errno.EAGAIN, os.strerror(errno.EAGAIN)) from error
-
-    return lock
 
 
 LOCK = _lock_of_system()

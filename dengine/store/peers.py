@@ -13,7 +13,8 @@ import sqlalchemy as sa
 from ..errors import SettingError, StoreError
 from ..recipe import Recipe
 from .connections import reading
-from .schema import DECISION, LABEL, PRODUCT_KEY, SETTING, VERSION
+from .queries import Scope
+from .schema import DECISION, LABEL, PRODUCT_KEY, SETTING
 
 # Settings of a recipe on which the arrays of a version depend.
 EMBEDDING = ("reducer", "params", "folds", "window", "novelty")
@@ -74,13 +75,10 @@ def check_peer_settings(
         return
     peer_values = _embedding_settings(peer_settings)
     values = _embedding_settings(settings)
-    # The first trace of any cell sets the product's trace spec.
-    is_open = None in (peer_values["trace"], values["trace"])
-    different = [
-        key
-        for key, value in peer_values.items()
-        if value != values[key] and not (is_open and key == "trace")
-    ]
+    if None in (values["trace"], peer_values["trace"]):
+        # The first trace of any cell sets the product's trace spec.
+        values["trace"] = peer_values["trace"]
+    different = [key for key in values if values[key] != peer_values[key]]
     if different:
         expected = ", ".join(f"{key} {peer_values[key]}" for key in different)
         actual = ", ".join(f"{key} {values[key]}" for key in different)
@@ -124,41 +122,28 @@ def list_cells(url: str) -> list[CellSummary]:
     labels and those of quarantined traces count; records that are only in a journal do not. Raise
     StoreError if the database is not there or is no store. Nothing is written.
     """
-    accepted = (
-        sa.select(VERSION.c.cell_id, sa.func.max(VERSION.c.version))
-        .where(VERSION.c.accepted == sa.true())
-        .group_by(VERSION.c.cell_id)
-    )
     with reading(url) as connection:
-        settings = connection.execute(sa.select(*SETTING.c["cell_id", "key", "value"])).all()
-        decisions = _count_by_cell(connection, DECISION)
-        labels = _count_by_cell(connection, LABEL)
-        versions = {row[0]: row[1] for row in connection.execute(accepted)}
-    products = {cell_id: value for cell_id, key, value in settings if key == PRODUCT_KEY}
-    summaries = []
-    for name in sorted({row.cell_id for row in settings}):
-        product = products.get(name)
-        cells = {name, *(cell for cell, other in products.items() if other == product)}
-        n_decisions, last_decision = decisions.get(name, (0, 0.0))
-        n_labels, last_label = labels.get(name, (0, 0.0))
-        summary = CellSummary(
-            cell_id=name,
-            product=product,
-            decisions=n_decisions,
-            labels=n_labels,
-            version=max((versions[cell] for cell in cells & versions.keys()), default=None),
-            last_seen=max(last_decision, last_label) if n_decisions else None,
-        )
-        summaries.append(summary)
-    return summaries
+        settings = connection.execute(sa.select(SETTING)).all()
+        products = {row.cell_id: row.value for row in settings if row.key == PRODUCT_KEY}
+        names = sorted({row.cell_id for row in settings})
+        return [_summarize(connection, Scope(name, products.get(name))) for name in names]
 
 
-def _count_by_cell(connection: sa.Connection, table: sa.Table) -> dict[str, tuple[int, float]]:
-    """Return, by cell, the number of a table's rows and the largest time, seconds since 1970.
-
-    Cells without rows are left out.
-    """
-    query = sa.select(table.c.cell_id, sa.func.count(), sa.func.max(table.c.time)).group_by(
-        table.c.cell_id
+def _summarize(connection: sa.Connection, cell: Scope) -> CellSummary:
+    """Return the summary of a cell, whose product `cell` names."""
+    (n_decisions, last_decision), (n_labels, last_label) = (
+        connection.execute(
+            sa.select(sa.func.count(), sa.func.max(table.c.time)).where(
+                table.c.cell_id == cell.cell_id
+            )
+        ).one()
+        for table in (DECISION, LABEL)
     )
-    return {name: (n, last) for name, n, last in connection.execute(query)}
+    return CellSummary(
+        cell_id=cell.cell_id,
+        product=cell.product,
+        decisions=n_decisions,
+        labels=n_labels,
+        version=cell.newest_version(connection) or None,
+        last_seen=max(last_decision, last_label or 0.0) if n_decisions else None,
+    )

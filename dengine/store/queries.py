@@ -5,13 +5,12 @@ into a product. `SqlStore` and `Database` compose their statements from them.
 """
 
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any
 
 import sqlalchemy as sa
 
 from ..errors import StoreError, expect
-from ..records import ACTIONS, Action, Reason
+from ..records import ACTIONS, Action
 from .records import FORGOTTEN
 from .schema import (
     CORRECTION,
@@ -20,11 +19,13 @@ from .schema import (
     LABEL,
     PRODUCT,
     PRODUCT_KEY,
-    RESERVED,
     SETTING,
     TRACE,
     VERSION,
+    insert_settings,
     lock,
+    read_setting,
+    read_settings,
 )
 
 
@@ -114,8 +115,6 @@ def cells_of(product: str) -> sa.Select[Any]:
     )
 
 
-# For a few products and columns: building the statement takes longer than running it.
-@lru_cache(maxsize=100)
 def newest_of(
     product: str, column: sa.Column[Any], *conditions: sa.ColumnElement[bool]
 ) -> sa.Select[Any]:
@@ -154,9 +153,7 @@ def join_product(connection: sa.Connection, cell_id: str, product: str | None) -
         If the cell has another product, if the name is empty or not printable, and if the cell has
         settings or labels already without a product: its labels were numbered without the others.
     """
-    is_own = SETTING.c.cell_id == cell_id
-    query = sa.select(SETTING.c.value).where(is_own, SETTING.c.key == PRODUCT_KEY)
-    stored: str | None = connection.execute(query).scalar()
+    stored = read_setting(connection, cell_id, PRODUCT_KEY)
     if product is None or stored == product:
         return stored
     expect(
@@ -168,23 +165,16 @@ def join_product(connection: sa.Connection, cell_id: str, product: str | None) -
     )
     is_name = bool(product.strip()) and product.isprintable()
     expect(is_name, "a product's name of printable characters", product, error=StoreError)
-    settings = connection.execute(
-        sa.select(SETTING.c.key).where(is_own, SETTING.c.key.not_in(RESERVED))
-    ).first()
-    label = connection.execute(
-        sa.select(LABEL.c.seq).where(LABEL.c.cell_id == cell_id).limit(1)
-    ).first()
+    has_labels = Scope(cell_id).newest(connection, LABEL.c.seq) > 0
     expect(
-        settings is None and label is None,
+        not (has_labels or read_settings(connection, cell_id)),
         f"a new cell for product {product!r}",
         cell_id,
         "it has worked without a product: name a new cell, and bring its labels over by an import",
         StoreError,
     )
     lock(connection, PRODUCT, product)
-    connection.execute(
-        sa.insert(SETTING), {"cell_id": cell_id, "key": PRODUCT_KEY, "value": product}
-    )
+    insert_settings(connection, cell_id, {PRODUCT_KEY: product})
     return product
 
 
@@ -194,6 +184,7 @@ CORRECTION_OF_LABEL = (CORRECTION.c.cell_id == LABEL.c.cell_id) & (
     CORRECTION.c.decision_id == LABEL.c.decision_id
 )
 WITH_LABELS = DECISION.outerjoin(LABEL, LABEL_OF_DECISION)
+TRACE_OF_LABEL = (TRACE.c.cell_id == LABEL.c.cell_id) & (TRACE.c.decision_id == LABEL.c.decision_id)
 TRACE_OF_DECISION = (TRACE.c.cell_id == DECISION.c.cell_id) & (TRACE.c.decision_id == DECISION.c.id)
 WITH_TRACES = DECISION.outerjoin(TRACE, TRACE_OF_DECISION)
 
@@ -237,11 +228,13 @@ SUCCESS: sa.ColumnElement[int | None] = sa.func.nullif(corrected_label(), FORGOT
 
 # Where a label comes from, after corrections: an accepted part that silence confirmed, and that is
 # known to be bad, is one of a stop, which came late.
-_CONFIRMED: sa.ColumnElement[str] = sa.literal_column("'confirmed'")
-_STOP: sa.ColumnElement[str] = sa.literal_column("'stop'")
-_BAD: sa.ColumnElement[int] = sa.literal_column("0")
 SOURCE: sa.ColumnElement[str | None] = sa.case(
-    ((LABEL.c.source == _CONFIRMED) & (corrected_label() == _BAD), _STOP), else_=LABEL.c.source
+    (
+        (LABEL.c.source == sa.literal_column("'confirmed'"))
+        & (corrected_label() == sa.literal_column("0")),
+        sa.literal_column("'stop'"),
+    ),
+    else_=LABEL.c.source,
 )
 
 
@@ -265,69 +258,7 @@ def past_query(cell_id: str) -> sa.Select[Any]:
     )
 
 
-def training_query(scope: Scope, corrected_to: int | None = None) -> sa.Select[Any]:
-    """Return the query for the labels that a model is trained on; it is not run.
-
-    Its columns are seq (the label's number), success, content_hash and decision_id. Labels that
-    were forgotten are left out, and so are labels of quarantined traces, which are stored but never
-    used in training. Corrections up to number `corrected_to` are applied; None: all. The labels are
-    those of the cell that `scope` names, and of all cells of its product. The rows are in no order.
-    """
-    label = corrected_label(corrected_to)
-    return sa.select(
-        LABEL.c.seq, label.label("success"), *LABEL.c["content_hash", "decision_id"]
-    ).where(scope.shared(LABEL.c.cell_id), TRAINS, label != FORGOTTEN)
-
-
 def n_decisions(cell_id: str) -> sa.ScalarSelect[int]:
     """Return the scalar subquery for the number of a cell's newest decision, NULL if none."""
-    decision = DECISION.alias("every")
-    of_cell = decision.c.cell_id == cell_id
-    return sa.select(sa.func.max(decision.c.number)).where(of_cell).scalar_subquery()
-
-
-def stretches_query(
-    cell_id: str, length: int, seconds: float = 0.0, start: float = 0.0
-) -> sa.Select[Any]:
-    """Return the query that counts a cell's decisions in stretches of equal length, oldest first.
-
-    A stretch is a run of consecutive decisions, or a period of time. It has a row only if it has
-    decisions.
-
-    Parameters
-    ----------
-    cell_id : str
-    length : int
-        Decisions per stretch.
-    seconds : float, default 0.0
-        Length of a stretch in time instead; 0.0: by number.
-    start : float, default 0.0
-        A time, in seconds since 1970, at which a stretch of `seconds` begins.
-
-    Returns
-    -------
-    sqlalchemy.Select
-        With the columns of `Stretch`, in their order: the number of decisions, the time of the
-        newest, and how many were verified, novel, accepted, accepted and bad (as corrected),
-        rejected by the model, and verified or rejected for a force limit. Stretches are sorted by
-        their newest decision. If `seconds` is not 0, `length` has no effect.
-    """
-    number = sa.func.row_number().over(order_by=DECISION.c.number) - 1
-    columns = (*DECISION.c["cell_id", "id", "time", "action", "reason"], number.label("number"))
-    every = sa.select(*columns).where(DECISION.c.cell_id == cell_id).subquery("every")
-    is_of_decision = (LABEL.c.cell_id == every.c.cell_id) & (LABEL.c.decision_id == every.c.id)
-    verified, accepted, rejected = (every.c.action == action.value for action in Action)
-    novel, outside = (every.c.reason == reason.value for reason in (Reason.NOVEL, Reason.OUTSIDE))
-    false_accepted = accepted & (SUCCESS == 0)
-    conditions = (verified, novel, accepted, false_accepted, rejected & ~outside, outside)
-    counts: list[sa.ColumnElement[Any]] = [
-        sa.func.sum(sa.case((condition, 1), else_=0)) for condition in conditions
-    ]
-    by_number = every.c.number - every.c.number % length
-    by_time = sa.func.floor((every.c.time - start) / seconds) if seconds else by_number
-    return (
-        sa.select(*[sa.func.count(), sa.func.max(every.c.time), *counts])
-        .select_from(every.outerjoin(LABEL, is_of_decision))
-        .group_by(by_time)
-        .order_by(sa.func.max(every.c.number))
-    )
+    query = sa.select(sa.func.max(DECISION.c.number)).where(DECISION.c.cell_id == cell_id)
+    return query.correlate(None).scalar_subquery()

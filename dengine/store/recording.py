@@ -11,10 +11,11 @@ import time
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import chain
 
 from ..errors import NotTakenError, log
 from .journal import Journal, LostJournalError, Record, encode_record
-from .records import Clock, StoredDecision, new_event
+from .records import Clock, new_event
 
 BATCH_SECONDS = 0.05  # a record waits so long for others before they are written together
 RETRY_SECONDS = 1.0  # between two attempts after a failure
@@ -27,18 +28,14 @@ class Entry:
 
     Attributes
     ----------
-    record : StoredDecision, NewLabel, Event or None
-        None for a decision that is in the journal: its trace takes too much memory.
-    decision_id : str
-        Of a decision; "" for other records.
+    record : StoredDecision, NewLabel or Event
     offset, end : int
-        Where it stands in the journal, in bytes; 0 until it is synced.
+        The bytes that it takes in the journal, from `offset` to before `end`; 0 until it is synced.
     time : float
         When it was recorded, by `time.monotonic`.
     """
 
-    record: Record | None
-    decision_id: str
+    record: Record
     offset: int = 0
     end: int = 0
     time: float = field(default_factory=time.monotonic)
@@ -48,19 +45,11 @@ class Entry:
         """Whether it is in the journal, and synced."""
         return self.end > 0
 
-    def place(self, offset: int, end: int) -> None:
-        """Note where the record stands in the journal; a decision is then dropped from memory.
-
-        It takes the bytes from `offset` to before `end`. From now on `is_synced` is true.
-        """
-        self.offset = offset
-        self.end = end
-        if self.decision_id:
-            self.record = None
-
 
 class Recorder:
     """Takes records, and writes them to a journal in batches.
+
+    The records also stay in memory until they are drained: 4 kB of a trace of 1,000 samples.
 
     `start` starts its thread, and `stop` ends it.
 
@@ -122,13 +111,10 @@ class Recorder:
     def oldest(self) -> float | None:
         """Time of recording of the oldest record that the database lacks, by `time.monotonic`.
 
-        None if it lacks none. For a record that an earlier process left, it is the time of `adopt`.
-        Hold `changed` meanwhile.
+        None if it lacks none. Hold `changed` meanwhile.
         """
-        for entries in (self.synced, self.unwritten):
-            if entries:
-                return entries[0].time
-        return None
+        oldest = next(chain(self.synced, self.unwritten), None)
+        return None if oldest is None else oldest.time
 
     def record(self, record: Record) -> Entry:
         """Add a record in memory, and wake the thread that writes it to the journal.
@@ -137,8 +123,7 @@ class Recorder:
         disk answers, the thread writes it within about BATCH_SECONDS (0.05 s), together with
         others. There is no limit to the number of records that wait.
         """
-        id_ = record.decision.id if isinstance(record, StoredDecision) else ""
-        entry = Entry(record, id_)
+        entry = Entry(record)
         with self.changed:
             self.n_recorded += 1
             if not self.unwritten:  # else the thread is awake already
@@ -149,19 +134,6 @@ class Recorder:
     def record_event(self, kind: str, text: str) -> None:
         """Add an event with the present time."""
         self.record(new_event(kind, text, self._clock()))
-
-    def adopt(self, record: Record, offset: int, end: int) -> Entry:
-        """Add a record that an earlier process left in the journal; it counts as synced.
-
-        It takes the bytes of the journal from `offset` to before `end`. Return its `Entry`, which
-        has these, and drops a decision from memory. The thread must not have been started, and no
-        other record may wait.
-        """
-        entry = self.record(record)
-        entry.place(offset, end)
-        self.n_synced += 1
-        self.synced.append(self.unwritten.popleft())
-        return entry
 
     def request_sync(self) -> None:
         """Ask that everything recorded so far be written to the disk at once; do not wait."""
@@ -263,7 +235,7 @@ class Recorder:
                 self.needs_drain = False
             if is_drained:  # without the lock: a disk that hangs would hang the cell
                 self._journal.clear()
-        blobs = [encode_record(entry.record) for entry in batch if entry.record is not None]
+        blobs = [encode_record(entry.record) for entry in batch]
         try:
             offsets = self._journal.append(blobs, self._clock())
         except LostJournalError as error:
@@ -272,7 +244,8 @@ class Recorder:
         with self.changed:
             ends = [*offsets[1:], self._journal.end]
             for entry, offset, end in zip(batch, offsets, ends, strict=True):
-                entry.place(offset, end)
+                entry.offset = offset
+                entry.end = end
                 self.synced.append(self.unwritten.popleft())
             self.n_synced += len(batch)
             self._error = ""

@@ -54,6 +54,7 @@ NO_TRACE: TraceArray = np.zeros((0, 0), dtype=np.float32)
 # The first label and a second one that replaces it: silence confirmed the part, then it stopped the
 # line.
 LATE_STOP = (True, Source.CONFIRMED), (False, Source.STOP)
+LABEL_WORDS = {True: "good", False: "bad", None: "none"}
 FORGOTTEN = 2  # beside 0 and 1: a label that takes part in nothing any more
 CHUNK = 500  # rows sent or fetched at a time
 KEEP = 5  # newest versions that keep their states
@@ -98,12 +99,9 @@ def already_reported(
         f"{'success' if success else 'failure'} from {source.value}"
         for success, source in (first, second)
     )
-    same = first[0] == second[0]
-    advice = (
-        "nothing more needs reporting"
-        if same
-        else "if the first was wrong, look at how the part was checked"
-    )
+    advice = "nothing more needs reporting"
+    if first[0] != second[0]:
+        advice = "if the first was wrong, look at how the part was checked"
     return ReportConflictError(
         f"Expected one report a decision, got a second on {decision_id!r}: {stored} was reported "
         f"first and stands, now came {new}; {advice}."
@@ -145,12 +143,15 @@ def check_state(report: RetrainReport, state: Arrays | None) -> State | None:
     Raise StoreError if `report.accepted` is True (the version is to be put in force) and `state` is
     None, and for an array of Python objects, which would need a pickle.
     """
-    if state is None and report.accepted:
-        raise StoreError(
-            f"Expected the arrays of accepted version {report.version}, got None; pass its state."
-        )
-    copies = None if state is None else {name: np.array(values) for name, values in state.items()}
-    for name, values in (copies or {}).items():
+    if state is None:
+        if report.accepted:
+            raise StoreError(
+                f"Expected the arrays of accepted version {report.version}, got None; pass its "
+                "state."
+            )
+        return None
+    copies = {name: np.array(values) for name, values in state.items()}
+    for name, values in copies.items():
         if values.dtype.hasobject:
             raise StoreError(f"Expected plain arrays, not {name!r}, which has {values.dtype}.")
     return copies
@@ -242,9 +243,7 @@ class StoredDecision:
     @property
     def label(self) -> str:
         """The label in a word: good, bad or none."""
-        if self.success is None:
-            return "none"
-        return "good" if self.success else "bad"
+        return LABEL_WORDS[self.success]
 
     def with_label(self, label: NewLabel) -> Self:
         """Return a copy that has the success and the source of a label, not its number and time."""
@@ -321,17 +320,17 @@ def overdue_outcomes(decision: Decision) -> list[OutcomeRecord]:
     `predicted` is VERIFY. So there are none, one or two, all with `seq` 0, not novel, with `silent`
     0 and the inclusion probability of the decision.
     """
-    accepts = int(decision.predicted is Action.ACCEPT)
-    rejects = 2 * int(decision.predicted is Action.REJECT)
+    probability = decision.inclusion_probability
     outcomes = []
     if decision.lower > 0.0:
-        outcomes.append((decision.lower, 1.0, False, accepts))
+        accepts = int(decision.predicted is Action.ACCEPT)
+        outcomes.append(
+            OutcomeRecord(0, decision.lower, 1.0, False, False, 0, accepts, probability)
+        )
     if decision.upper < 1.0:
-        outcomes.append((0.0, decision.upper, True, rejects))
-    return [
-        OutcomeRecord(0, lower, upper, good, False, 0, predicted, decision.inclusion_probability)
-        for lower, upper, good, predicted in outcomes
-    ]
+        rejects = 2 * int(decision.predicted is Action.REJECT)
+        outcomes.append(OutcomeRecord(0, 0.0, decision.upper, True, False, 0, rejects, probability))
+    return outcomes
 
 
 @dataclass(frozen=True, slots=True)
@@ -515,18 +514,13 @@ def columns(record_type: Any) -> dict[str, tuple[type, bool]]:
     """Return, by name, the type of each field of a record class, and whether it may be None.
 
     A record class is a dataclass or NamedTuple with type hints. The type is a plain one: that of
-    `dict[str, int]` is `dict`, and of a union, which must be one with None, it is the first that is
-    not None. The result is cached; do not change it.
+    `dict[str, int]` is `dict`, and of a union, which must be one with None as the last, it is the
+    first. The result is cached; do not change it.
     """
     fields: dict[str, tuple[type, bool]] = {}
     for name, hint in get_type_hints(record_type).items():
         is_union = isinstance(hint, UnionType)
-        types = [
-            option
-            for option in (get_args(hint) if is_union else (hint,))
-            if option is not type(None)
-        ]
-        fields[name] = (_plain_type(types[0]), is_union)
+        fields[name] = (_plain_type(get_args(hint)[0] if is_union else hint), is_union)
     return fields
 
 
@@ -570,15 +564,13 @@ def from_row(record_type: Callable[..., T], row: Mapping[str, Any], **given: Any
         If the row lacks a field, or a value cannot be converted to the type of its field. Fields of
         type str, int and float take any value, unchecked.
     """
-    wanted = {
-        name: type_
-        for name, (type_, _) in columns(record_type).items()
-        if name in row and name not in given
-    }
     try:
-        return record_type(
-            **{name: _from_column(row[name], type_) for name, type_ in wanted.items()}, **given
-        )
+        values = {
+            name: _from_column(row[name], type_)
+            for name, (type_, _) in columns(record_type).items()
+            if name in row and name not in given
+        }
+        return record_type(**values, **given)
     except (ValueError, TypeError) as error:
         name = getattr(record_type, "__name__", record_type)
         raise StoreError(

@@ -4,6 +4,7 @@ Their columns are the fields of the records that they hold (see records.py), and
 to a cell, `cell_id`. `Database` and the queries use them.
 """
 
+from collections.abc import Mapping
 from enum import StrEnum
 from typing import Any
 
@@ -42,9 +43,6 @@ def _columns(record: type, *names: str, key: str = "") -> list[sa.Column[Any]]:
     A record class is a dataclass whose objects are stored as rows. A field that may be None becomes
     a column that may be NULL. `key` names the field that is part of the primary key.
     """
-    selected = {
-        name: field for name, field in columns(record).items() if not names or name in names
-    }
     return [
         sa.Column(
             name,
@@ -53,7 +51,8 @@ def _columns(record: type, *names: str, key: str = "") -> list[sa.Column[Any]]:
             primary_key=name == key,
             autoincrement=False,
         )
-        for name, (type_, optional) in selected.items()
+        for name, (type_, optional) in columns(record).items()
+        if not names or name in names
     ]
 
 
@@ -180,11 +179,40 @@ def prepare_tables(connection: sa.Connection, cell_id: str, name: str) -> None:
         check_schema(connection, name)
     else:
         METADATA.create_all(connection)
-    query = sa.select(SETTING).where(SETTING.c.cell_id == cell_id, SETTING.c.key == SCHEMA_KEY)
-    if connection.execute(query).first() is None:
-        connection.execute(
-            sa.insert(SETTING), {"cell_id": cell_id, "key": SCHEMA_KEY, "value": SCHEMA}
-        )
+    if read_setting(connection, cell_id, SCHEMA_KEY) is None:
+        insert_settings(connection, cell_id, {SCHEMA_KEY: SCHEMA})
+
+
+def read_settings(connection: sa.Connection, cell_id: str) -> dict[str, str]:
+    """Return a cell's settings, by key, without those that the store itself keeps (`RESERVED`).
+
+    {} for an unknown cell.
+    """
+    query = sa.select(SETTING.c.key, SETTING.c.value).where(
+        SETTING.c.cell_id == cell_id, SETTING.c.key.not_in(RESERVED)
+    )
+    return {row.key: row.value for row in connection.execute(query)}
+
+
+def read_setting(connection: sa.Connection, cell_id: str, key: str) -> str | None:
+    """Return a setting of a cell, also one that the store itself keeps; None if there is none."""
+    is_key = (SETTING.c.cell_id == cell_id) & (SETTING.c.key == key)
+    return connection.execute(sa.select(SETTING.c.value).where(is_key)).scalar()
+
+
+def insert_settings(connection: sa.Connection, cell_id: str, settings: Mapping[str, str]) -> None:
+    """Insert settings that a cell does not have yet; nothing is committed."""
+    rows = [{"cell_id": cell_id, "key": key, "value": value} for key, value in settings.items()]
+    if rows:
+        connection.execute(sa.insert(SETTING), rows)
+
+
+def _stored_columns(connection: sa.Connection, table: str) -> set[str]:
+    """Return the names of the columns that a table has in the database; none without a table."""
+    inspector = sa.inspect(connection)
+    if not inspector.has_table(table):
+        return set()
+    return {column["name"] for column in inspector.get_columns(table)}
 
 
 def _add_columns(connection: sa.Connection) -> None:
@@ -192,12 +220,9 @@ def _add_columns(connection: sa.Connection) -> None:
 
     They are NULL in its rows. A table that has them, or is no table of a store, is not changed.
     """
-    inspector = sa.inspect(connection)
     for column in ADDED:
         table = column.table.name
-        names = set()
-        if inspector.has_table(table):
-            names = {info["name"] for info in inspector.get_columns(table)}
+        names = _stored_columns(connection, table)
         if names >= {"cell_id", "sum"} and column.name not in names:
             type_ = column.type.compile(connection.dialect)
             connection.execute(sa.text(f'ALTER TABLE "{table}" ADD COLUMN "{column.name}" {type_}'))
@@ -210,12 +235,11 @@ def check_schema(connection: sa.Connection, name: str) -> None:
     too. Columns that a later dengine added to the schema (ADDED) may be missing, and others may be
     there. `name` is the name of the database, for the error.
     """
-    inspector = sa.inspect(connection)
-    is_complete = True
-    for table in METADATA.tables.values():
-        expected = {column.name for column in table.c if column not in ADDED}
-        names = inspector.get_columns(table.name) if inspector.has_table(table.name) else []
-        is_complete = is_complete and expected <= {column["name"] for column in names}
+    is_complete = all(
+        {column.name for column in table.c if column not in ADDED}
+        <= _stored_columns(connection, table.name)
+        for table in METADATA.tables.values()
+    )
     schemas: list[str] = []
     if is_complete:
         # The one query over all cells.

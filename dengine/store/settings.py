@@ -8,9 +8,8 @@ import sqlalchemy as sa
 
 from ..errors import StoreError
 from .cell_table import CellTable
-from .ledger import read_settings
 from .peers import check_peer_settings
-from .schema import PRODUCT, RESERVED, SETTING, lock
+from .schema import PRODUCT, RESERVED, SETTING, insert_settings, lock, read_settings
 
 
 class SettingTable(CellTable):
@@ -50,12 +49,7 @@ class SettingTable(CellTable):
                 check_peer_settings(settings, peer_settings, name, self._scope.product)
         is_replaced = self._database.own(SETTING) & SETTING.c.key.not_in(RESERVED)
         connection.execute(sa.delete(SETTING).where(is_replaced))
-        rows = [
-            {"cell_id": self._database.cell_id, "key": key, "value": value}
-            for key, value in settings.items()
-        ]
-        if rows:
-            connection.execute(sa.insert(SETTING), rows)
+        insert_settings(connection, self._database.cell_id, settings)
 
     def of_peers(self) -> dict[str, dict[str, str]]:
         """Return the settings of the product's other cells, by cell; {} without a product.

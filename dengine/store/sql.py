@@ -99,17 +99,15 @@ class SqlStore(AbstractContextManager["SqlStore"]):
             StoreError,
         )
         self.cell_id = cell_id
-        is_valid = keep_versions is None or (type(keep_versions) is int and keep_versions >= 2)
         expect(
-            is_valid,
+            keep_versions is None or (type(keep_versions) is int and keep_versions >= 2),
             "keep_versions of 2 or more, or None for all",
             keep_versions,
             f"leave it at {KEEP}",
             StoreError,
         )
-        alone = product is None or url is not None
         expect(
-            alone,
+            product is None or url is not None,
             "no product of a store in memory",
             product,
             "name a file or a server, which its cells share",
@@ -127,15 +125,6 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         self.corrections = CorrectionTable(self.database, self.settings, self.versions)
         self._insertion = RecordInsertion(self.database, self.corrections)
         self._journal: Journal | None = None
-
-    def flush(self) -> None:
-        """Wait until the outbox's records are in the database, but not beyond its time limit.
-
-        Without an outbox nothing happens. Raise StoreError if the store is closed; if the database
-        of a running cell does not answer, nothing is raised.
-        """
-        self.database.check_open()
-        self.database.before_use()
 
     def claim_cell(self) -> Journal:
         """Claim the cell for this engine, and open its journal; `close` gives both up.

@@ -11,10 +11,10 @@ kept elsewhere is passed as `expect`; and that somebody with the right to write 
 history anew, which a keyed ledger shows, or again a digest from elsewhere.
 """
 
-import json
 import re
 import struct
-from collections.abc import Callable, Iterator, Mapping
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import islice
@@ -31,8 +31,8 @@ from .ledger import (
     START,
     check_key,
     entry_digest,
-    find_settings_faults,
     ledger_key,
+    parse_object,
     row_sum,
     rows_digest,
     state_sum,
@@ -49,6 +49,8 @@ from .schema import (
     SETTING,
     TRACE,
     VERSION,
+    read_setting,
+    read_settings,
 )
 
 # The column of each chained table that, with the cell, identifies a row.
@@ -56,9 +58,9 @@ KEY = {
     name: next(c.name for c in table.primary_key if c.name != "cell_id")
     for name, table in CHAINED.items()
 }
-# A row in memory: its ledger entry, its sum as stored, and its sum as computed now.
-ROW_SUMS = struct.Struct("<q32s32s")
-SUMS = np.dtype([("entry", "<i8"), ("stored", "V32"), ("now", "V32")])  # the same
+# A row in memory: its ledger entry, and its sum as it is stored.
+ROW_SUM = struct.Struct("<q32s")
+SUMS = np.dtype([("entry", "<i8"), ("sum", "V32")])  # the same
 # A row of the first table needs one of the second.
 REQUIRED = ((DECISION, TRACE), (TRACE, DECISION), (LABEL, DECISION))
 CUT_OFF = (
@@ -148,7 +150,7 @@ def verify_history(
     checked cells has. Of missing entries and of SQLite's findings only the first 20 and 100 are
     returned. A journal that is missing or cannot be read is no fault: `waiting` of the cell is None
     then. Of the settings that the store itself keeps (`RESERVED`) a changed product is not noticed.
-    An SQLite file that was not in WAL mode is set to it (`reading`). Takes about 80 bytes of memory
+    An SQLite file that was not in WAL mode is set to it (`reading`). Takes about 40 bytes of memory
     per row.
 
     Parameters
@@ -192,16 +194,8 @@ def verify_history(
         checks = [CellCheck(connection, name, on_rows) for name in names]
         for check in checks:
             check_key(connection, check.cell_id, check.key)
-            faults += check.run()
             entries, _, loss = journals[check.cell_id]
-            if loss:
-                problem = f"is damaged: {loss} The next engine records that as an alarm"
-                faults.append(HistoryFault(check.cell_id, "journal", "", problem))
-            faults += [
-                HistoryFault(check.cell_id, LEDGER.name, f"entry {number}", CUT_OFF)
-                for number, digest in sorted(set(entries))
-                if digest not in check.digests
-            ]
+            faults += check.run(entries, loss)
     if expected and not any(
         digest.startswith(expected) for check in checks for digest in check.digests
     ):
@@ -283,51 +277,49 @@ class CellCheck:
     ) -> None:
         self.connection = connection
         self.cell_id = cell_id
-        self.on_rows = on_rows
+        self._on_rows = on_rows or (lambda n_rows: None)
         self.key = ledger_key()
         self.digests: list[str] = []
         self.rows = 0
         self._sums = {table: bytearray() for table in CHAINED}
         self._is_unreadable = False
 
-    def run(self) -> list[HistoryFault]:
+    def run(self, entries: Sequence[EntryName], loss: str) -> list[HistoryFault]:
         """Read all rows of the cell, and return what is wrong, table by table; [] if nothing is.
+
+        `entries` are the ledger entries that the cell's journal names, and `loss` says what is
+        damaged in the journal, "" if nothing is. Both are compared at the end.
 
         Fill `digests`, the digests of the ledger's entries, and `rows`, the number of rows read,
         and call `on_rows` with the number of rows just read. A database error is a fault, too, and
         not raised; after one, it is not checked whether decisions, traces and labels belong
         together.
         """
-        faults = [
-            fault
-            for table in CHAINED
-            for fault in self._catch_database_errors(table, self._check_rows(table))
+        checks = [(table, self._check_rows(table)) for table in CHAINED]
+        checks += [
+            (LEDGER.name, self._check_ledger()),
+            (SETTING.name, self._check_settings()),
+            (EVENT.name, self._check_losses()),
         ]
-        faults += self._catch_database_errors(LEDGER.name, self._check_ledger())
-        faults += self._catch_database_errors(SETTING.name, self._check_settings())
-        faults += self._catch_database_errors(EVENT.name, self._check_losses())
-        if not self._is_unreadable:  # else everything that cannot be read would be missing
-            for table, required in REQUIRED:
-                faults += self._catch_database_errors(
-                    table.name, self._check_pairs(table, required)
-                )
-        if self.on_rows is not None:
-            self.on_rows(self.rows % CHUNK)
+        checks += [(table.name, self._check_pairs(table, required)) for table, required in REQUIRED]
+        faults: list[HistoryFault] = []
+        for table, check in checks:
+            try:
+                faults.extend(check)  # faults before an error stay
+            except sa.exc.DatabaseError as error:
+                self._is_unreadable = True
+                problem = f"cannot be read to its end: {error.orig}"
+                faults.append(self._fault(table, "", problem))
+        if loss:
+            problem = f"is damaged: {loss} The next engine records that as an alarm"
+            faults.append(self._fault("journal", "", problem))
+        faults += [
+            self._fault(LEDGER.name, f"entry {number}", CUT_OFF)
+            for number, digest in sorted(set(entries))
+            if digest not in self.digests
+        ]
+        self._on_rows(self.rows % CHUNK)
         return faults
-
-    def _catch_database_errors(
-        self, table: str, faults: Iterator[HistoryFault]
-    ) -> Iterator[HistoryFault]:
-        """Yield the faults of a check; a database error ends the check and is yielded as a fault.
-
-        `table` is the name of the table that this fault is about. After such an error `run` does
-        not look for missing rows.
-        """
-        try:
-            yield from faults
-        except sa.exc.DatabaseError as error:
-            self._is_unreadable = True
-            yield self._fault(table, "", f"cannot be read to its end: {error.orig}")
 
     def _fault(self, table: str, key: object, problem: str) -> HistoryFault:
         """Return a fault of this cell."""
@@ -358,16 +350,15 @@ class CellCheck:
         """
         for row in self._read_raw(table):
             self.rows += 1
-            if self.on_rows is not None and self.rows % CHUNK == 0:
-                self.on_rows(CHUNK)
+            if self.rows % CHUNK == 0:
+                self._on_rows(CHUNK)
             key = row[KEY[table]]
             entry = row["entry"]
             stored = row["sum"]
             if entry is None and stored is None:
                 yield self._fault(table, key, "is not chained: something beside dengine wrote it")
                 continue
-            now = row_sum(table, row)
-            if now != stored:
+            if row_sum(table, row) != stored:
                 yield self._fault(table, key, "was changed")
             if (
                 table == VERSION.name
@@ -376,44 +367,38 @@ class CellCheck:
             ):
                 yield self._fault(table, key, "its state was changed")
             if isinstance(entry, int):
-                self._sums[table] += ROW_SUMS.pack(entry, _bytes(stored), now)
+                self._sums[table] += ROW_SUM.pack(entry, _bytes(stored))
 
     def _check_ledger(self) -> Iterator[HistoryFault]:
         """Yield a fault for each ledger entry that was changed or is missing; fill `digests`.
 
         `digests` gets the digest of each entry, hexadecimal, oldest first. An entry must fit the
-        digest of the entry before, and the sums of its rows, either as stored or as computed by
-        `_check_rows`: a changed row is a fault of its own. After an entry that was changed, only
-        this entry is a fault. Only the first 20 missing entries are yielded; those behind the
-        newest that an entry or a row names cannot be noticed.
+        digest of the entry before, and the sums of its rows as they are stored: that a row does not
+        fit its sum is a fault of its own. After an entry that was changed, only this entry is a
+        fault. Only the first 20 missing entries are yielded; those behind the newest that an entry
+        or a row names cannot be noticed.
         """
-        sums = {table: np.frombuffer(packed, SUMS) for table, packed in self._sums.items()}
-        sums = {
-            table: rows[np.argsort(rows["entry"], kind="stable")] for table, rows in sums.items()
-        }
+        sums = {}
+        for table, packed in self._sums.items():
+            rows = np.frombuffer(packed, SUMS)
+            sums[table] = rows[np.argsort(rows["entry"])]
         numbers: set[int] = set()
         previous = {START}
         for row in sorted(self._read_raw(LEDGER.name), key=lambda row: _integer(row["number"])):
             number = _integer(row["number"])
-            stored = {}
-            now = {}
+            of_entry = {}
             for table, rows in sums.items():
-                of_entry = rows[slice(*np.searchsorted(rows["entry"], (number, number + 1)))]
-                if len(of_entry):
-                    stored[table] = of_entry["stored"].tolist()
-                    now[table] = of_entry["now"].tolist()
+                begin, end = np.searchsorted(rows["entry"], (number, number + 1))
+                if begin < end:
+                    of_entry[table] = rows["sum"][begin:end].tolist()
             head = {name: value for name, value in row.items() if name != "digest"}
             # After an entry that was changed, its digest as stored and as computed are both
             # accepted as the one before: only that entry is a fault.
             computed = {entry_digest(digest, head, self.key) for digest in previous}
             digest = _bytes(row["digest"])
-            if digest not in computed or _bytes(row["rows"]) not in (
-                rows_digest(stored),
-                rows_digest(now),
-            ):
-                yield self._fault(
-                    LEDGER.name, f"entry {row['number']}", _entry_fault(row["added"], now)
-                )
+            if digest not in computed or _bytes(row["rows"]) != rows_digest(of_entry):
+                problem = _entry_fault(row["added"], of_entry)
+                yield self._fault(LEDGER.name, f"entry {row['number']}", problem)
             previous = {digest, *computed}
             self.digests.append(digest.hex())
             numbers.add(number)
@@ -431,10 +416,19 @@ class CellCheck:
         (`RESERVED`), so a change of these is no fault here. If the setting with the version of the
         tables is missing (no engine has opened the cell), that is a fault, too.
         """
-        for key, problem in find_settings_faults(self.connection, self.cell_id).items():
-            yield self._fault(SETTING.name, key, problem)
-        is_schema = (SETTING.c.cell_id == self.cell_id) & (SETTING.c.key == SCHEMA_KEY)
-        if self.connection.execute(sa.select(SETTING.c.key).where(is_schema)).first() is None:
+        stored = read_settings(self.connection, self.cell_id)
+        is_copy = (LEDGER.c.cell_id == self.cell_id) & LEDGER.c.settings.is_not(None)
+        copies = sa.select(LEDGER.c.settings).where(is_copy).order_by(LEDGER.c.number.desc())
+        # An entry that was changed is found by the chain.
+        chained = parse_object(self.connection.execute(copies.limit(1)).scalar())
+        for key in sorted(stored.keys() | chained.keys()):
+            if key not in chained:
+                yield self._fault(SETTING.name, key, "is not chained")
+            elif key not in stored:
+                yield self._fault(SETTING.name, key, "is missing")
+            elif stored[key] != chained[key]:
+                yield self._fault(SETTING.name, key, "was changed")
+        if read_setting(self.connection, self.cell_id, SCHEMA_KEY) is None:
             yield self._fault(
                 SETTING.name, SCHEMA_KEY, "is missing: no engine has opened this cell"
             )
@@ -448,17 +442,16 @@ class CellCheck:
     def _check_pairs(self, table: sa.Table, required: sa.Table) -> Iterator[HistoryFault]:
         """Yield a fault for each row of `table` that needs a row in `required` and has none.
 
+        None after an error of the database.
         The row that is needed has the same decision id. The fault names the table `required`.
         """
-        key = table.c[KEY[table.name]]
-        required_key = required.c[KEY[required.name]]
-        is_pair = (required.c.cell_id == table.c.cell_id) & (required_key == key)
-        query = (
-            sa.select(key)
-            .select_from(table.outerjoin(required, is_pair))
-            .where(table.c.cell_id == self.cell_id, required_key.is_(None))
+        if self._is_unreadable:  # everything that could not be read would be missing
+            return
+        keys, required_keys = (
+            sa.select(part.c[KEY[part.name]]).where(part.c.cell_id == self.cell_id)
+            for part in (table, required)
         )
-        for id_ in self.connection.execute(query).scalars():
+        for id_ in self.connection.execute(sa.except_(keys, required_keys)).scalars():
             yield self._fault(required.name, id_, f"is missing: a row of {table.name} is there")
 
 
@@ -469,17 +462,12 @@ def _entry_fault(added: Any, sums: Mapping[str, list[bytes]]) -> str:
     were changed. `added` is the entry's column of that name, the numbers in JSON; if it is damaged,
     all are 0. `sums` has the sums of the rows that are there, by table.
     """
-    counts: dict[str, int] = {}
-    with suppress(TypeError, ValueError):
-        counts = dict(json.loads(added))
-    present = {table: len(rows) for table, rows in sums.items()}
-    different = [
-        name
-        for name in sorted(counts.keys() | present.keys())
-        if counts.get(name, 0) != present.get(name, 0)
-    ]
+    counts = Counter[str](parse_object(added))
+    present = Counter({table: len(rows) for table, rows in sums.items()})
     missing = "; ".join(
-        f"{counts.get(name, 0)} of {name}, {present.get(name, 0)} found" for name in different
+        f"{counts[name]} of {name}, {present[name]} found"
+        for name in sorted({*counts, *present})
+        if counts[name] != present[name]
     )
     return f"chained {missing}" if missing else "was changed, or rows that it chains were"
 

@@ -116,12 +116,10 @@ class VersionTable(CellTable):
         does not keep are deleted. The product is then locked until the transaction ends.
         """
         number: int = row["version"]
-        if (
-            self._scope.product is not None and row["accepted"]
-        ):  # a peer's may have been stored before
-            lock(connection, PRODUCT, self._scope.product)
-            number = max(number, self._scope.newest_version(connection) + 1)
         if row["accepted"]:
+            if self._scope.product is not None:  # a peer's may have been stored before
+                lock(connection, PRODUCT, self._scope.product)
+                number = max(number, self._scope.newest_version(connection) + 1)
             with_state = connection.execute(
                 self._accepted_query().where(VERSION.c.state.is_not(None))
             ).all()
@@ -215,9 +213,7 @@ class VersionTable(CellTable):
         query = sa.select(*VERSION.c["cell_id", "version", "last_seq", "state", "state_sum"])
         is_retrain = self._scope.shared(VERSION.c.cell_id) & (VERSION.c.retrain == retrain)
         row = self._read(query.where(is_retrain))[0]
-        if row.state is None or (
-            row.state_sum is not None and state_sum(row.state) != row.state_sum
-        ):
+        if row.state is None or state_sum(row.state) != row.state_sum:
             raise VersionError(
                 f"Expected the state of version {row.version} as it was stored in "
                 f"{self._database.name}, its bytes have changed; restore the store from a copy."

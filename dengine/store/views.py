@@ -5,19 +5,24 @@ explanations are computed from them.
 """
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import SettingError, expect, shortened
+from ..errors import expect
 from ..records import Action, Reason, Source
-from .records import Outcomes
+from .records import LABEL_WORDS, Outcomes
 
-ENUMERATIONS = {"action": Action, "predicted": Action, "reason": Reason}
-LABELS: dict[str, bool | None] = {"good": True, "bad": False, "none": None}
+LABELS = {word: success for success, word in LABEL_WORDS.items()}
+OPTIONS: dict[str, Collection[str]] = {
+    "action": list(Action),
+    "predicted": list(Action),
+    "reason": list(Reason),
+    "label": list(LABELS),
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,37 +48,27 @@ class HistoryFilter:
         For a value that a field cannot have.
     """
 
-    action: Action | None = None
-    reason: Reason | None = None
+    action: str | None = None
+    reason: str | None = None
     label: str | None = None
     since: float | None = None
     until: float | None = None
-    predicted: Action | None = None
+    predicted: str | None = None
     part: str | None = None
 
     def __post_init__(self) -> None:
-        """Convert words to enumerations; raise SettingError for a value that is not valid."""
-        for name, enumeration in ENUMERATIONS.items():
-            try:
-                if (value := getattr(self, name)) is not None:
-                    object.__setattr__(self, name, enumeration(value))
-            except ValueError:
-                options = ", ".join(enumeration)
-                raise SettingError(
-                    f"Expected {name} to be one of {options}, got {shortened(value)}."
-                ) from None
-        expect(
-            self.label is None or self.label in LABELS,
-            f"label to be one of {', '.join(LABELS)}",
-            self.label,
-        )
+        """Raise SettingError for a value that is not valid."""
+        for name, options in OPTIONS.items():
+            value = getattr(self, name)
+            is_valid = value is None or value in options
+            expect(is_valid, f"{name} to be one of {', '.join(options)}", value)
 
 
 @dataclass(frozen=True, slots=True)
 class PastLabel:
     """A label as it was recorded, with what a rule was updated with.
 
-    The fields up to `decided` are those of `NewLabel` and of the label's row, the others those of
+    The fields up to `point` are those of `NewLabel` and of the label's row, the others those of
     `OutcomeRecord`.
     """
 
@@ -87,7 +82,6 @@ class PastLabel:
     quarantined: bool
     silent: int
     point: NDArray[np.float32] | None
-    decided: float
     lower: float
     upper: float
     novel: bool
@@ -120,15 +114,6 @@ class DecisionGroup:
     n: int
 
     @property
-    def is_false_reject(self) -> bool:
-        """Whether the model, not a force limit, rejected these parts, and they were good."""
-        return (
-            self.action is Action.REJECT
-            and self.reason is not Reason.OUTSIDE
-            and self.label == "good"
-        )
-
-    @property
     def label(self) -> str:
         """The corrected label in a word: good, bad, forgotten, overdue or none.
 
@@ -137,12 +122,11 @@ class DecisionGroup:
         there is no label and the check is not overdue, or none was asked for. A check of a
         quarantined trace (stored, but never used in training) is never overdue.
         """
-        if self.source is not None:
-            if self.success is None:
-                return "forgotten"
-            return "good" if self.success else "bad"
-        is_overdue = self.aged and self.action is Action.VERIFY and not self.quarantined
-        return "overdue" if is_overdue else "none"
+        if self.source is not None and self.success is None:
+            return "forgotten"
+        is_check = self.action is Action.VERIFY and not self.quarantined
+        is_overdue = self.source is None and self.aged and is_check
+        return "overdue" if is_overdue else LABEL_WORDS[self.success]
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,14 +138,11 @@ class Tally:
     groups : tuple of DecisionGroup
     first, last : float or None
         Times of the oldest and the newest decision, in seconds since 1970; None without decisions.
-    last_label : float or None
-        When the newest label came; None without labels.
     """
 
     groups: tuple[DecisionGroup, ...]
     first: float | None
     last: float | None
-    last_label: float | None = None
 
     def count(self, is_counted: Callable[[DecisionGroup], bool] = lambda group: True) -> int:
         """Return the number of decisions in the groups for which `is_counted` is true.
@@ -191,25 +172,26 @@ class Tally:
         an audit without a label that is not overdue is in no field. Nor are parts counted as
         rejected, or as false rejects, that an operator's limits rejected (`Reason.OUTSIDE`).
         """
+        actions = Counter[Action]()
         by_action = Counter[tuple[Action, str]]()
         audited = Counter[tuple[Action, str]]()  # by what the model alone would have done
-        for group in self.groups:
-            by_action[group.action, group.label] += group.n
-            audited[group.predicted, group.label] += group.n if group.audit else 0
-        actions = self.by("action")
         accept = Action.ACCEPT
         reject = Action.REJECT
-        outside = self.count(lambda group: (group.action, group.reason) == (reject, Reason.OUTSIDE))
+        for group in self.groups:
+            audited[group.predicted, group.label] += group.n if group.audit else 0
+            if (group.action, group.reason) != (reject, Reason.OUTSIDE):
+                actions[group.action] += group.n
+                by_action[group.action, group.label] += group.n
         return Outcomes(
             accepted=actions[accept],
             false_accepts=by_action[accept, "bad"],
             confirmed=by_action[accept, "good"],
             audited_accepts=audited[accept, "bad"] + audited[accept, "good"],
             audited_accepts_bad=audited[accept, "bad"],
-            rejected=actions[reject] - outside,
+            rejected=actions[reject],
             audited_rejects=audited[reject, "bad"] + audited[reject, "good"],
             audited_rejects_good=audited[reject, "good"],
-            false_rejects=self.count(lambda group: group.is_false_reject),
+            false_rejects=by_action[reject, "good"],
             forgotten_accepts=by_action[accept, "forgotten"],
             forgotten_audited_accepts=audited[accept, "forgotten"],
             forgotten_audited_rejects=audited[reject, "forgotten"],

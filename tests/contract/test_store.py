@@ -59,7 +59,6 @@ def test_a_decision_returns_as_it_was_put_and_any_trace_bit_for_bit(
     given = Decision(name, Action.VERIFY, Action.ACCEPT, *numbers, "Stück 7\\0")
     assert store.decisions.get(name) is None
     put_decision(store, given, values, content_hash, quarantined)
-    store.flush()
     result = store.decisions.get(name)
     assert (result.decision, result.success, result.source) == (given, None, None)
     assert (result.trace.shape, result.trace.tobytes()) == (values.shape, values.tobytes())

@@ -39,7 +39,7 @@ def in_use(tmp_path, data):
     """An engine whose newest labels are in its journal alone."""
     with DataEngine("pca", retrain_every=1000, store=str(tmp_path / "engine.db")) as engine:
         learn(engine, data, range(IN_STORE))
-        engine.store.flush()
+        engine.flush()
         with held(tmp_path / "engine.db"):
             learn(engine, data, range(IN_STORE, IN_STORE + IN_JOURNAL))
             yield engine
@@ -197,7 +197,7 @@ def test_every_cell_of_a_file_is_in_its_backup(tmp_path, data):
             engine = DataEngine("pca", retrain_every=1000, store=SqlStore(str(file), name))
             engines[name] = cells.enter_context(engine)
             learn(engine, data, rows[:1])  # it sets the TraceSpec, which waits for the store
-            engine.store.flush()
+            engine.flush()
         cells.enter_context(held(file))
         for name, engine in engines.items():
             learn(engine, data, parts[name][1:])

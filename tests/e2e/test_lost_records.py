@@ -27,7 +27,7 @@ def left(data, tmp_path_factory):
     store = folder / "engine.db"
     with DataEngine("pca", retrain_every=1000, store=str(store)) as engine:
         learn(engine, data, range(IN_STORE))
-        engine.store.flush()
+        engine.flush()
         with closing(sqlite3.connect(store, isolation_level=None)) as other:
             other.execute("BEGIN IMMEDIATE")
             learn(engine, data, range(IN_STORE, IN_STORE + 5))

@@ -24,9 +24,8 @@ AS_A_USER = [
     "--inh-caps=-all",
     "--ambient-caps=-all",
 ]
-# What is there: all that a closed store leaves, what a killed process leaves, and that without its
-# index of the log.
-LEFT = {"closed": ("",), "killed": ("", "-wal", "-shm"), "copied with its log": ("", "-wal")}
+# What is there: all that a closed store leaves, and what a killed process leaves.
+LEFT = {"closed": ("",), "killed": ("", "-wal", "-shm")}
 LOCKED = {"a folder": (0o555, 0o644), "a file": (0o755, 0o444), "both": (0o555, 0o444)}
 CASES = [(left, locked) for left in LEFT for locked in LOCKED]
 
@@ -71,7 +70,7 @@ def stores(tmp_path_factory, make_data):
     data, place = make_data(60, samples=80), tmp_path_factory.mktemp("made")
     with DataEngine("pca", retrain_every=30, store=str(place / "engine.db")) as engine:
         learn(engine, data, range(60))
-        engine.store.flush()
+        engine.flush()
         for name, suffixes in LEFT.items():
             (place / name).mkdir()
             for suffix in suffixes:

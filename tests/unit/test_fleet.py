@@ -321,7 +321,7 @@ def test_a_peers_version_that_is_damaged_is_left_out_and_the_next_one_answers(fl
     first, second = taught(fleet, parts, 60)
     version = second.version
     first.retrain()
-    first.store.flush()
+    first.flush()
     spoiled = sa.update(VERSION).where(VERSION.c.version == first.version).values(state=b"nothing")
     with first.store.database._engine.begin() as connection:
         connection.execute(spoiled)

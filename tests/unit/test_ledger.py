@@ -38,7 +38,6 @@ def write(store: SqlStore) -> SqlStore:
     store.settings.save({"recipe": "a = 1", "trace": "{}"})
     for i, x in enumerate(traces):
         put_decision(store, replace(decision(f"d{i}"), part=f"SN-{i}"), x, i - 3, i == 5)
-    store.flush()
     first, *labels = (
         NewLabel(f"d{i}", i % 2 == 0, Source.AUDIT, 1, x, overdue_to=i)
         for i, x in enumerate(rng.normal(size=(10, 2)).astype(np.float32))

@@ -378,7 +378,7 @@ class History:
         `tests.slow.faults` ends processes by SIGKILL.
         """
         with self._call(step.cell, "killed") as engine:
-            engine.store.flush()
+            engine.flush()
             engine.store.close()
             self._open(step.cell)
 
