@@ -315,14 +315,6 @@ class Description:
         is_older = isinstance(version, int) and version <= VERSION
         wanted = f"version {VERSION} of {where}"
         expect_data(is_older, wanted, version, "install a newer dengine")
-        channels = values.get("channels")
-        if isinstance(channels, Mapping):
-            channels = {
-                column: about if isinstance(about, Mapping) else {"unit": about}
-                for column, about in channels.items()
-                if column != UNKNOWN
-            }
-            values = {**values, "channels": channels}
         return _made(cls, values, where)  # type: ignore[no-any-return]
 
     @classmethod
@@ -434,9 +426,9 @@ class Description:
         before the dot in a key is no section.
         """
         values = self.to_dict()
-        for section, sources in SOURCES.items():
-            if any(f"{section}.{source}" in stated for source in sources):
-                for source in sources:
+        for section in ("label", "part"):
+            if any(f"{section}.{source}" in stated for source in SOURCES):
+                for source in SOURCES:
                     values.get(section, {}).pop(source, None)
         for name, value in stated.items():
             of_column = OF_COLUMN.fullmatch(name)
@@ -444,8 +436,7 @@ class Description:
             table = values
             for step in steps:
                 table = table.setdefault(step, {})
-                wanted = f"a section before the dot in {name}"
-                expect_data(isinstance(table, dict), wanted, step)
+                expect_data(isinstance(table, dict), f"a section before the dot in {name}", step)
             table[last] = value
         return replace(Description.from_dict(values), notes=self.notes)
 
@@ -476,11 +467,8 @@ SECTIONS: dict[str, Any] = {
     "traces": TraceForm,
     "seen": Seen,
 }
-# Keys of which one states where something stands, and the others are cleared.
-SOURCES = {
-    "label": ("column", "path", "line", "topic", "listing"),
-    "part": ("column", "path", "line"),
-}
+# Keys of which one states where a label or part number stands, and the others are cleared.
+SOURCES = ("column", "path", "line", "topic", "listing")
 # Keys of one column, whose name may have dots in it: `rows.Status of A.1.keep`.
 OF_COLUMN = re.compile(r"(rows|channels)\.(.+)\.(keep|drop|invalid|unit|factor|limit)", re.DOTALL)
 KINDS: dict[Any, str] = {
@@ -496,10 +484,10 @@ def _made(kind: Any, value: Any, where: str) -> Any:
     """Return a value of a TOML file, converted to `kind`, the annotated type of its key.
 
     A table becomes a dataclass or a dict, and a list a tuple; so does a single value if several are
-    expected. `?` may stand in place of a text, number, boolean or choice. A number or boolean
-    becomes a text if only a text is expected, and a whole number a float if a number is. Raises
-    DataError for an unknown key or choice, for a value of another type, and for a number that is
-    not finite if a number is expected; `where` is its name in the message.
+    expected. `?` may stand in place of a text, number, boolean or choice, and of a mapping its key
+    `?` is left out. A single value in place of a `Channel` is its unit. Raises DataError for an
+    unknown key or choice, and for a value of another type (see `_as_kind`); `where` is its name in
+    the message.
     """
     origin = get_origin(kind)
     args = get_args(kind)
@@ -509,17 +497,21 @@ def _made(kind: Any, value: Any, where: str) -> Any:
     if origin is Literal and value != UNKNOWN:
         expect_one_of(args, str(value), where)
         return value
-    if origin is not Mapping and not is_dataclass(kind):
+    if origin is Literal or kind in KINDS:
         return _as_kind(kind, value, where)
+    if kind is Channel and not isinstance(value, Mapping):
+        value = {"unit": value}
     expect_data(isinstance(value, Mapping), f"{where} to be a table", value)
     if origin is Mapping:
-        return {str(name): _made(args[1], v, f"{where}.{name}") for name, v in value.items()}
+        return {
+            str(name): _made(args[1], item, f"{where}.{name}")
+            for name, item in value.items()
+            if name != UNKNOWN
+        }
     keys = {about.name: about.type for about in fields(kind) if about.compare}
-    values = {}
-    for name, item in value.items():
+    for name in value:
         expect_one_of(keys, name, where)
-        values[name] = _made(keys[name], item, f"{where}, {name}")
-    return kind(**values)
+    return kind(**{name: _made(keys[name], value[name], f"{where}, {name}") for name in value})
 
 
 def _as_kind(kind: Any, value: Any, where: str) -> Any:
@@ -535,8 +527,9 @@ def _as_kind(kind: Any, value: Any, where: str) -> Any:
         return value
     if kind is str and isinstance(value, int | float):
         return str(value)
-    is_kind = isinstance(value, int | float if kind is float else kind)
-    is_kind = is_kind and isinstance(value, bool) == (kind is bool)
+    is_kind = isinstance(value, bool) == (kind is bool) and (
+        isinstance(value, kind) or (kind is float and isinstance(value, int))
+    )
     is_finite = kind is not float or (is_kind and abs(value) <= sys.float_info.max)
     expect_data(is_kind and is_finite, f"{KINDS[kind]} in {where}", value)
     return float(value) if kind is float else value

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import DataError, instead, listed, shortened
-from ..records import Floats
+from ..records import Floats, TraceArray
 from .description import TextForm
 
 Cells = NDArray[Any]
@@ -46,7 +46,7 @@ class Table:
     columns : mapping of str to array, shape (rows,)
         Numbers, times, or texts as objects. In a file of a single part a column with one cell holds
         for all rows.
-    lines : sequence of int
+    lines : sequence or array of int
         Line in the file of each row, or one line for all rows.
     units : mapping of str to str
         Units that the file states for its columns.
@@ -66,7 +66,7 @@ class Table:
 
     source: str
     columns: Mapping[str, Cells]
-    lines: Sequence[int]
+    lines: Sequence[int] | Cells
     units: Mapping[str, str] = field(default_factory=dict)
     above: Sequence[str] = ()
     header: int = 0
@@ -96,11 +96,9 @@ class Table:
         Their line numbers are selected, too. A column of one cell, and a single line number, hold
         for all rows and stay, even if no row is selected; so do `damage`, `origin` and all else.
         """
-        lines = self.lines
-        if len(lines) > 1:
-            lines = lines[rows] if isinstance(rows, slice) else np.asarray(lines)[rows]
         columns = {name: c[rows] if len(c) > 1 else c for name, c in self.columns.items()}
-        return replace(self, columns=columns, lines=lines)
+        lines = np.asarray(self.lines)
+        return replace(self, columns=columns, lines=lines[rows] if len(lines) > 1 else lines)
 
     def words(self, name: str) -> Cells:
         """Return the cells of a column as texts, without blanks around them.
@@ -190,7 +188,7 @@ class Recording:
     """
 
     source: str
-    trace: NDArray[np.float32]
+    trace: TraceArray
     label: int
     part: str
     length: int

@@ -131,7 +131,7 @@ def read_frame(frame: Any, source: str) -> Table:
     """
     frame = frame.reset_index() if frame.index.name is not None else frame
     columns = {str(name): frame[name].to_numpy() for name in frame.columns}
-    return Table(source, columns, range(1, len(frame) + 1))
+    return Table(source, columns, np.arange(1, len(frame) + 1))
 
 
 def read_parquet(content: bytes, source: str) -> Table:

@@ -180,39 +180,24 @@ class LabelReader:
 
         `table` is the table of the recording, and `part` its part number. If the source is a
         listing, the key that was found in it is added to `used`, the set of keys found so far.
-        Raises UnreadableError if there is no label, if rows of the listing contradict each other,
-        or if a word has no stated meaning, and DataError if `source.path` is no regular expression
-        with one group.
-        """
-        source = self.source
-        words = self.words(table, part)
-        line = 0 if source.listing or source.path else table.line(0)
-        labels = {self.meaning(word, line) for word in words}
-        if len(labels) > 1:
-            raise UnreadableError(
-                f"Expected one label for {part or table.path}, got {listed(sorted(words))}",
-                line,
-                source.column,
-            )
-        return labels.pop()
-
-    def meaning(self, word: str, line: int = 0) -> int | None:
-        """Return what a word of the source means: 1 good, 0 bad, None not checked.
-
-        A word that is stated as several of these has the first of these meanings: good, then bad.
-        Words are compared exactly. Raises UnreadableError for a word whose meaning is not stated;
-        `line` is its line in the file.
+        Words are compared exactly; a word that is stated as several of these has the first of these
+        meanings. Raises UnreadableError if there is no label, if rows of the listing contradict
+        each other, or if a word has no stated meaning, and DataError if `source.path` is no regular
+        expression with one group.
         """
         source = self.source
         meanings: dict[str, int | None] = dict.fromkeys(source.unchecked)
         meanings |= dict.fromkeys(source.bad, 0) | dict.fromkeys(source.good, 1)
-        if word not in meanings:
-            raise UnreadableError(
-                f"Expected a label among {listed(meanings)}, got {shortened(word)}",
-                line,
-                source.column,
-            )
-        return meanings[word]
+        words = self.words(table, part)
+        fault = ""
+        if unknown := [word for word in words if word not in meanings]:
+            fault = f"Expected a label among {listed(meanings)}, got {shortened(unknown[0])}"
+        elif len({meanings[word] for word in words}) > 1:
+            fault = f"Expected one label for {part or table.path}, got {listed(sorted(words))}"
+        if fault:
+            line = 0 if source.listing or source.path else table.line(0)
+            raise UnreadableError(fault, line, source.column)
+        return meanings[words[0]]
 
     def unused_note(self) -> str:
         """Return a sentence on the keys of the listing in which no recording was found, or "".

@@ -9,7 +9,7 @@ import csv
 import io
 import re
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import replace
 
@@ -70,12 +70,9 @@ def read_text(content: bytes, source: str, form: TextForm, kind_of: Kind = lambd
     cells = split_line("".join(top[units - 1 : units]), form.delimiter)
     stated = dict(zip(names, map(str.strip, cells), strict=False))
     columns = dict.fromkeys(names, np.empty(0))
-    table = Table(source, columns, range(first, end), stated, top[: (header or first) - 1], header)
-    kinds = {name: kind_of(name) for name in names}
-    plain = {} if form.drop else _read_plain(content, table, form, kinds)
-    if plain:
-        return replace(table, columns={**columns, **plain})
-    return _read_strictly(content, table, form)
+    lines = np.arange(first, end)
+    table = Table(source, columns, lines, stated, top[: (header or first) - 1], header)
+    return _read_plain(content, table, form, kind_of) or _read_strictly(content, table, form)
 
 
 def to_utf8(content: bytes, encoding: str) -> bytes:
@@ -150,7 +147,7 @@ def _names(top: Sequence[str], header: int, form: TextForm) -> list[str]:
     """
     names = [*form.names]
     if names and names[-1].endswith(REST):
-        rest = names.pop()[: -len(REST)]
+        rest = names.pop().removesuffix(REST)
         n = len(split_line(top[-1], form.delimiter)) - len(names)
         names += [f"{rest}{i}" for i in range(n)]
     elif not names:
@@ -161,19 +158,22 @@ def _names(top: Sequence[str], header: int, form: TextForm) -> list[str]:
     return names
 
 
-def _read_plain(
-    content: bytes, table: Table, form: TextForm, kinds: Mapping[str, str]
-) -> dict[str, Cells]:
-    """Return the needed columns by name, read by pandas; none if anything in the file is not plain.
+def _read_plain(content: bytes, table: Table, form: TextForm, kind_of: Kind) -> Table | None:
+    """Return the table with its needed columns, read by pandas; None if the file is not plain.
 
     Not plain are a row with a wrong number of cells, an empty line, an empty last cell, a cell with
-    a line break, and one that is not a finite number in a column of numbers, like an empty one.
+    a line break, and one that is not a finite number in a column of numbers, like an empty one; nor
+    is a file of which `form.drop` leaves out lines.
 
-    table : only the names of its columns and the lines of its rows are used. kinds : the kind of
-    each column: "number", "word" (its cells are read as texts), or "" if it is not needed.
+    table : has the names of the columns, which are empty, and the lines of the rows. kind_of :
+    returns the kind of a column: "number", "word" (its cells are read as texts), or "" if it is not
+    needed and stays empty.
     """
     import pandas as pd
 
+    if form.drop:
+        return None
+    kinds = {name: kind_of(name) for name in table.columns}
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", pd.errors.DtypeWarning)
@@ -182,26 +182,25 @@ def _read_plain(
                 sep=r"\s+" if form.delimiter == BLANK else form.delimiter,
                 header=None,
                 skiprows=table.lines[0] - 1,
-                names=[*table.columns],
+                names=[*kinds],
                 decimal=form.decimal,
                 dtype={name: "category" for name, kind in kinds.items() if kind == WORD},
                 keep_default_na=False,
             )
     except (ValueError, OverflowError):  # a row of too many cells, among others
-        return {}
+        return None
     is_whole = len(frame) == len(table.lines) and isinstance(frame.index, pd.RangeIndex)
     if not is_whole or frame.iloc[:, -1].isin(["", np.nan]).any():  # the end of a cut row
-        return {}
-    columns = dict[str, Cells]()
+        return None
+    columns = {**table.columns}
     for name, kind in kinds.items():
-        cells = frame[name]
-        if kind == WORD:
-            columns[name] = np.array(cells.array.categories, dtype=object)[cells.array.codes]
-        elif kind == NUMBER:
-            columns[name] = cells.to_numpy()
-            if cells.dtype.kind not in "iuf" or not np.isfinite(columns[name]).all():
-                return {}
-    return columns
+        if kind:
+            columns[name] = frame[name].to_numpy(object if kind == WORD else None)
+        if kind == NUMBER and not (
+            columns[name].dtype.kind in "iuf" and np.isfinite(columns[name]).all()
+        ):
+            return None
+    return replace(table, columns=columns)
 
 
 def _read_strictly(content: bytes, table: Table, form: TextForm) -> Table:
@@ -215,7 +214,7 @@ def _read_strictly(content: bytes, table: Table, form: TextForm) -> Table:
     rows = dict[int, list[str]]()
     damage = list[UnreadableError]()
     for i, line in enumerate(content.decode().split("\n"), 1):
-        if i in table.lines and line.strip() and not line.startswith(form.drop):
+        if i >= table.lines[0] and line.strip() and not line.startswith(form.drop):
             rows[i] = split_line(line, form.delimiter)
             if len(rows[i]) != n:
                 message = (
