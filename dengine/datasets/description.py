@@ -13,7 +13,7 @@ import re
 import sys
 import tomllib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, fields, is_dataclass, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
 
@@ -400,6 +400,11 @@ class Description:
     def labels(self) -> tuple[LabelSource, ...]:
         """The source of labels, and those that must agree with it."""
         return (self.label, *self.check)
+
+    @property
+    def is_cut(self) -> bool:
+        """Whether long recordings are cut into parts, as `[windows]` says."""
+        return bool(self.windows.trigger or self.windows.listing)
 
     @property
     def open_keys(self) -> Words:

@@ -2,7 +2,6 @@
 
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from functools import partial
 from importlib.resources import files
 from pathlib import Path
@@ -78,8 +77,7 @@ def load_dataset(
     """
     stated = channels.split(",") if isinstance(channels, str) else channels or ()
     names = tuple(map(str.strip, stated))
-    expect_data(samples is None or samples >= 1, "1 or more samples", samples)
-    read = None if description is not None else own_reader(source)
+    read = own_reader(source) if description is None else None
     if read is not None:
         data = read()
         data = data.select(names) if names else data
@@ -89,10 +87,10 @@ def load_dataset(
         about = about.with_channels(names) if names else about
         traces = about.traces
         is_stated = isinstance(traces.samples, int) and traces.lengths != "resample"
-        if samples and not (is_stated and samples <= traces.samples):
-            about = replace(about, traces=replace(traces, samples=samples))
+        if samples is not None and not (is_stated and samples <= traces.samples):
+            about = about.with_values({"traces.samples": samples})
         data = read_recordings(place, about, progress)
-    return data.cut(samples) if samples else data
+    return data if samples is None else data.cut(samples)
 
 
 def saved_description(source: FilePath) -> Path:
@@ -160,9 +158,9 @@ def missing_text(path: Path, proposal: Description) -> str:
     It lists the open keys of the proposed description, whose value is `?`, with the notes on them,
     and has the commands that show and save the proposal.
     """
-    notes = {key: proposal.notes.get(key, "") for key in proposal.open_keys}
-    questions = "".join(f"\n  {key}: {note}" for key, note in notes.items())
-    state = "".join(f" --set {key}=..." for key in notes)
+    keys = proposal.open_keys
+    questions = "".join(f"\n  {key}: {proposal.notes.get(key, '')}" for key in keys)
+    state = "".join(f" --set {key}=..." for key in keys)
     return (
         f"Expected the description {saved_description(path)}, found none. Look at the proposal "
         f"with `dengine data {path}`, and write it with `dengine data {path} --save{state}`."

@@ -181,10 +181,9 @@ class Recording:
         Number of the part; "" if none is stated.
     length : int
         Number of samples as recorded.
-    start : float
-        Time of the first sample in seconds, counted from the clock's own zero; NaN without a clock.
-    rank : str
-        Word in the column that `order` names, by which recordings are sorted; "" for other orders.
+    rank : object
+        What recordings are sorted by, of one type for all: the time of the first sample, or the
+        `natural_key` of a path or word, as `order` in the description says; "" for order `name`.
     """
 
     source: str
@@ -192,8 +191,7 @@ class Recording:
     label: int
     part: str
     length: int
-    start: float
-    rank: str
+    rank: Any
 
 
 def as_word(cell: Any) -> str:

@@ -61,12 +61,7 @@ def read_messages(path: Path, topics: Collection[str] | None) -> Iterator[Messag
         ) from error
 
 
-def read_bag(
-    files: Files,
-    title: str,
-    description: Description,
-    faults: list[Fault],
-) -> Table:
+def read_bag(files: Files, title: str, description: Description, faults: list[Fault]) -> Table:
     """Return a table with a row for each message that has the channels, in the order of `log_time`.
 
     Its columns are the channels, `log_time`, the time of the log, and `stamp`, that in the
@@ -142,11 +137,9 @@ def _rows_of(
                 if topic in events:
                     events[topic].append((logged, message.data))
                 if topic in topics:
-                    values = [field(message) for field in fields]
-                    # in nanoseconds; 0 without a header
                     stamp = getattr(getattr(message, "header", None), "stamp", None)
                     stamped = stamp.sec * 10**9 + stamp.nanosec if stamp else 0
-                    rows.append((logged, stamped, *values))
+                    rows.append((logged, stamped, *(field(message) for field in fields)))
     if not rows:
         why = f" {faults[0]}." if faults else ""
         raise DataError(f"Expected messages of {listed(topics)}, found none.{why}")
@@ -165,9 +158,8 @@ def _cells_of(messages: list[tuple[int, Any]], logs: Cells, is_verdict: bool) ->
     """
     messages.sort(key=itemgetter(0))
     times = [time for time, _ in messages]
-    words = [word for _, word in messages]
+    words = [None, *(word for _, word in messages)]
     places = np.searchsorted(times, logs, side="left" if is_verdict else "right")
-    if not is_verdict:
-        return as_cells([words[i - 1] if i else None for i in places])
-    is_new = np.diff(places, append=len(times)) > 0
-    return as_cells([words[i] if new else None for i, new in zip(places, is_new, strict=True)])
+    if is_verdict:
+        places = np.where(np.diff(places, append=len(times)) > 0, places + 1, 0)
+    return as_cells([words[place] for place in places])

@@ -2,7 +2,6 @@
 
 import re
 from contextlib import suppress
-from zoneinfo import ZoneInfo
 
 import numpy as np
 
@@ -102,7 +101,7 @@ def column_times(table: Table, name: str, unit: str, clock: Clock, form: TextFor
     is_date = cells.dtype.kind == "M"
     if is_date or is_dated(unit):
         values, first = _dates(table, name, unit, clock)
-        period = 0.0 if is_date or any(map(has_day, (unit, *clock.format))) else DAY
+        period = 0.0 if is_date or any(map(has_day, clock.format)) else DAY
     else:
         scale = scale_of(unit)
         times: Cells = table.numbers(name, form)
@@ -138,12 +137,13 @@ def _dates(table: Table, name: str, unit: str, clock: Clock) -> Times:
     ):
         times = pd.to_datetime(texts, format=form, errors="coerce")
         if times.dt.tz is None:
-            zone = ZoneInfo(clock.zone) if clock.zone and has_date else "UTC"
+            zone = (has_date and clock.zone) or "UTC"
             times = times.dt.tz_localize(zone, ambiguous="infer")
     table.refuse(times.isna().to_numpy(), f"a time of the form {unit}", name)
+    first = times.iloc[0]
     zero = pd.Timestamp("1970-01-01" if has_date else "1900-01-01", tz="UTC")
-    values = (times - times.iloc[0]).dt.total_seconds().to_numpy(np.float64)
-    return values, (times.iloc[0] - zero).total_seconds()
+    values = (times - first).dt.total_seconds().to_numpy(np.float64)
+    return values, (first - zero).total_seconds()
 
 
 def check_steps(seconds: Floats, clock: Clock, table: Table) -> None:

@@ -5,7 +5,6 @@ a `Dataset`. What does not follow the description becomes a `Fault`.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,7 +20,7 @@ from ..checks import check_description, lost_note, without_repeats
 from ..dataset import Dataset, Fault, make_dataset, unit_text
 from ..description import ANY, ORDERS, Channel, Description, RowWords, TextForm
 from ..table import Cells, Recording, Table, UnreadableError
-from ..units import conversion, unit_in
+from ..units import bare, conversion, unit_in
 from .bags import read_bag
 from .clock import check_steps, times_of
 from .files import caught, find_files, natural_key, read_file
@@ -61,34 +60,38 @@ def recording_of(
     """
     clock = description.time
     form = description.text
+    order = description.order
     table, is_lost = kept_rows(table.whole(), description.rows)
     seconds = None
-    start = np.nan
+    rank: Any = ""
     if clock.column:
-        if clock.sort:
-            order = np.argsort(times_of(table, clock, form)[0], kind="stable")
-            table = table.take(order)
-            is_lost = is_lost[order]
         seconds, start = times_of(table, clock, form)
+        if clock.sort:
+            rows = np.argsort(seconds, kind="stable")
+            table = table.take(rows)
+            is_lost = is_lost[rows]
+            seconds, start = times_of(table, clock, form)
         check_steps(seconds, clock, table)
-    rows = [samples_of(table, *item, form) for item in description.channels.items()]
-    lengths = [*map(len, rows if seconds is None else [*rows, seconds])]
+        rank = start if order == "time" else rank
+    samples = [samples_of(table, *item, form) for item in description.channels.items()]
+    lengths = [*map(len, samples if seconds is None else [*samples, seconds])]
     if len({*lengths}) > 1:
         raise UnreadableError(f"Expected channels and times of one length, got {lengths}")
-    samples = np.stack(rows)
     if description.rows:
-        samples[:, is_lost] = np.nan
+        for values in samples:
+            values[is_lost] = np.nan
     part = part_of(description.part, table)
-    if description.windows.trigger or description.windows.listing:
-        part = part or table.path
+    if not part and description.is_cut:
+        part = table.path
     label = label_of(labels, table, part)
     if label is None:
         return None
-    rank = without_label(description.label, table.path) if description.order == "path" else ""
-    if description.order not in ORDERS:
-        rank = table.one_word(description.order, "first")
-    trace = fitted(samples, seconds, description)
-    return Recording(table.source, trace, label, part, lengths[0], start, rank)
+    if order == "path":
+        rank = natural_key(without_label(description.label, table.path))
+    elif order not in ORDERS:
+        rank = natural_key(table.one_word(order, "first"))
+    trace = fitted(np.stack(samples), seconds, description)
+    return Recording(table.source, trace, label, part, lengths[0], rank)
 
 
 @instead(UnreadableError, "Expected columns of one length", IndexError, ValueError)
@@ -127,16 +130,14 @@ def samples_of(table: Table, column: str, channel: Channel, form: TextForm) -> F
     unit of another quantity in the name is ignored.
     """
     values = table.numbers(column, form)
-    factor = 1.0
-    with suppress(DataError):  # a name may have another quantity, as `U [V]` of a force
-        factor = conversion(unit_in(column.rstrip(ANY)), channel.unit)
-    try:
-        if unit := table.units.get(column):
-            factor = conversion(unit, channel.unit)
-    except DataError as error:
+    unit = table.units.get(column)
+    factor = conversion(unit or unit_in(column.rstrip(ANY)), channel.unit)
+    if factor is None and unit:
+        wanted = f"the unit {channel.unit}, or one that converts to it"
         line = form.units + table.header * isinstance(form.header, str)
-        raise UnreadableError(str(error), line, column) from error
-    return values * (factor * channel.factor)
+        raise UnreadableError(f"Expected {wanted}, got {bare(unit)}", line, column)
+    # A name may have another quantity, as `U [V]` of a force.
+    return values * ((factor or 1.0) * channel.factor)
 
 
 def label_of(labels: Sequence[LabelReader], table: Table, part: str) -> int | None:
@@ -206,8 +207,7 @@ def read_recordings(
                     n_unlabelled += recording is None
         if progress is not None:
             progress(1)
-    is_timed = description.order == "time"
-    recordings.sort(key=lambda item: (item.start if is_timed else 0, natural_key(item.rank)))
+    recordings.sort(key=lambda item: item.rank)
     recordings, repeats = without_repeats(recordings)
     faults += repeats
     if not recordings:
@@ -216,15 +216,19 @@ def read_recordings(
             f"Expected recordings in {name}, none is left: {len(faults)} have faults, "
             f"{n_unlabelled} no label.{why}"
         )
-    data = dataset_of(recordings, description)
-    n_found = len(data) + len(faults) + n_unlabelled
+    n_found = len(recordings) + len(faults) + n_unlabelled
     n_seen = description.seen.recordings
     notes = [label.unused_note() for label in labels]
     if n_found < n_seen:
         notes.append(f"The description was made for {n_seen} recordings, now there are {n_found}.")
     notes.append(lost_note(recordings))
-    kept_notes = tuple(filter(None, notes))
-    return replace(data, name=name, faults=tuple(faults), notes=kept_notes, unlabelled=n_unlabelled)
+    return replace(
+        dataset_of(recordings, description),
+        name=name,
+        faults=tuple(faults),
+        notes=tuple(filter(None, notes)),
+        unlabelled=n_unlabelled,
+    )
 
 
 def files_of(
@@ -262,10 +266,7 @@ def parts_of(
     """
     table = file if isinstance(file, Table) else table_of(read_file(file), name, description)
     for part in split(table, description):
-        if description.windows.trigger or description.windows.listing:
-            yield from cut(part, description, base)
-        else:
-            yield part
+        yield from cut(part, description, base) if description.is_cut else [part]
 
 
 def dataset_of(recordings: Sequence[Recording], description: Description) -> Dataset:

@@ -16,7 +16,7 @@ from dataclasses import replace
 import numpy as np
 
 from ..description import TextForm
-from ..table import Cells, Table, UnreadableError
+from ..table import Table, UnreadableError
 
 COMMENT = re.compile(r"^[#%]+\s*")
 BLANK = " "

@@ -11,12 +11,11 @@ from ...records import Floats
 from ..description import Clock, Description
 from ..table import Table, UnreadableError
 from ..triggers import StartFinder, as_trigger
-from .clock import column_times, times_of
+from .clock import times_of
 from .frames import as_cells
 from .places import in_listing, listing_table
 from .split import verdicts_of
 
-EPOCH = 1e8  # seconds: smaller times of a listing count from the start of the recording
 TOLERANCE = 1e-5  # seconds: float64 rounds dates to less
 Windows = Iterator[tuple[str, slice, str]]  # the key of a part, its rows, and what is wrong
 
@@ -44,12 +43,17 @@ def cut(table: Table, description: Description, base: Path) -> Iterator[Table]:
     ends = [*(rows.start for _, rows, _ in windows[1:]), None]
     for (key, rows, fault), end in zip(windows, ends, strict=True):
         part = table.take(rows)
-        columns = {**part.columns}
+        verdicts = {}
         for topic in verdicts_of(description):
             words = table.column(topic)[rows.start : end]
-            columns[topic] = as_cells([word for word in words if word is not None][:1])
-        damage = [UnreadableError(fault)] if fault else []
-        yield replace(part, source=f"{name}, {key}", path=key, columns=columns, damage=damage)
+            verdicts[topic] = as_cells([word for word in words if word is not None][:1])
+        yield replace(
+            part,
+            source=f"{name}, {key}",
+            path=key,
+            columns={**part.columns, **verdicts},
+            damage=[UnreadableError(fault)] if fault else [],
+        )
 
 
 def _triggered(table: Table, times: Floats, description: Description, base: Path) -> Windows:
@@ -82,38 +86,34 @@ def _listed(table: Table, times: Floats, description: Description, base: Path) -
     """Yield the key, the rows and the fault ("" for none) of each window, by increasing start.
 
     The listing, a file in the folder `base`, has the key (the part's number), start and end of each
-    window. `times`, shape (rows,), are the recording's, in seconds. If they begin at 1e8 s or
-    later, like dates, and all ends in the listing are smaller, its times count from the first of
-    `times`. The rows are those from the start to before the end (less 1e-5 s, for rounding). A
-    window has a fault if it overlaps an earlier one, has no samples, or goes beyond the recording
-    by more than 1.5 steps of the stated rate (without one: at all); one without samples gets the
-    first row. Raises DataError if the listing or its times cannot be read.
+    window. `times`, shape (rows,), are the recording's, in seconds. The rows are those from the
+    start to before the end (less 1e-5 s, for rounding). A window has a fault if it overlaps an
+    earlier one, has no samples, or goes beyond the recording by more than 1.5 steps of the stated
+    rate (without one: at all); one without samples gets the first row. Raises DataError if the
+    listing or its times cannot be read.
     """
     about = description.windows
     form = description.text
-    clock = Clock(zone=description.time.zone)
     bounds = []
     with in_listing(about.listing):
         listing = listing_table(base / about.listing, form)
         keys = listing.words(about.key)
         for column in (about.start, about.end):
-            relative, first = column_times(listing, column, about.format, clock, form)
-            bounds.append(relative + first)
-    begins, ends = np.array(bounds) - TOLERANCE
-    if ends.max() < EPOCH <= times[0]:
-        begins += times[0]
-        ends += times[0]
-    step = 1.5 / (description.time.rate_hz or np.inf) + TOLERANCE
+            clock = Clock((column,), (about.format,), description.time.zone)
+            seconds, start = times_of(listing, clock, form)
+            bounds.append(seconds + (start - TOLERANCE))
+    begins, ends = bounds
+    margin = 1.5 / (description.time.rate_hz or np.inf) + TOLERANCE
     latest = -np.inf
     for i in np.argsort(begins, kind="stable"):
         begin = begins[i]
         end = ends[i]
+        rows = np.flatnonzero((times >= begin) & (times < end))
         fault = ""
-        inside = np.flatnonzero((times >= begin) & (times < end))
         if begin < latest - TOLERANCE:
             fault = "Expected windows apart, it overlaps the one before"
-        elif not len(inside) or begin < times[0] - step or end > times[-1] + step:
+        elif not len(rows) or begin < times[0] - margin or end > times[-1] + margin:
             fault = "Expected samples in the whole window, it has none or goes beyond the recording"
         latest = max(latest, end)
-        rows = slice(inside[0], inside[-1] + 1) if len(inside) else slice(0, 1)
-        yield str(keys[i]), rows, fault
+        window = slice(rows[0], rows[-1] + 1) if len(rows) else slice(0, 1)
+        yield str(keys[i]), window, fault
