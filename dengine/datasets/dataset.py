@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import DataError, TraceError, expect, instead, listed
-from ..records import Ints, TraceSpec
+from ..records import Ints, TraceArray, TraceSpec
 from ..traces import as_traces
 
 if TYPE_CHECKING:
@@ -67,7 +67,7 @@ class Fault:
         return f"{self.source}{line}{column}: {self.message}"
 
 
-@dataclass(frozen=True, slots=True, repr=False)
+@dataclass(frozen=True, slots=True)
 class Dataset:
     """Labelled traces, in the order of their recording.
 
@@ -107,7 +107,7 @@ class Dataset:
         label come first.
     """
 
-    X: NDArray[np.float32]
+    X: TraceArray
     y: NDArray[np.int8]
     name: str = "data"
     rate_hz: float | None = None
@@ -126,14 +126,6 @@ class Dataset:
 
     def __len__(self) -> int:
         return len(self.y)
-
-    def __repr__(self) -> str:
-        shape = " x ".join(map(str, self.X.shape[1:]))
-        good = int(self.y.sum())
-        return (
-            f"<Dataset {self.name}: {len(self)} traces, {shape} samples, {good} good, "
-            f"{len(self.faults)} left out>"
-        )
 
     @property
     def cube(self) -> NDArray[np.float32]:

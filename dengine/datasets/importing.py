@@ -81,9 +81,8 @@ def check_agreement(data: Dataset, trace_spec: TraceSpec) -> None:
     must both have the `fit` "resample", or neither. The number of channels is not compared.
     """
     spec = data.spec
-    fits = {spec.fit, trace_spec.fit}
-    is_same_fit = len(fits) == 1 or "resample" not in fits
-    is_fitted = is_same_fit and spec.samples == trace_spec.samples
+    is_resampled = {item.fit == "resample" for item in (spec, trace_spec)}
+    is_fitted = len(is_resampled) == 1 and spec.samples == trace_spec.samples
     wanted = f"recordings brought to {trace_spec.samples} samples by {trace_spec.fit}"
     do = "state these in [traces], or what is known would count again"
     is_fitted = is_fitted or data.lengths is None
@@ -92,7 +91,7 @@ def check_agreement(data: Dataset, trace_spec: TraceSpec) -> None:
     is_rate = None in rates or math.isclose(*rates, rel_tol=RATE_TOLERANCE)  # type: ignore[arg-type]
     expect(is_rate, f"traces at {rates[0]} Hz", rates[1], "resample them", TraceError)
     names = trace_spec.columns
-    is_same = spec.columns == names or not (spec.columns and names)
+    is_same = spec.columns in ((), names) or not names
     expect(is_same, f"the channels {', '.join(names)}", spec.columns, "", TraceError)
 
 
@@ -242,11 +241,15 @@ def import_parts(
         If the store cannot be read or written.
     """
     gate = TraceGate(trace_spec)
-    counts: dict[str, Any] = dict.fromkeys(
-        ("imported", "quarantined", "repeated", "contradicted"), 0
-    )
+    counts: Any = Counter(imported=0, quarantined=0, repeated=0)
+    # The accepted parts without a report since the last label that counted them, or since the last
+    # change of the policy. Otherwise the next decision confirms an accepted part.
     counts_unreported = policy.stops == "some"
-    n_unreported = _count_unreported(store, policy)
+    n_unreported = 0
+    if counts_unreported:
+        since = int(store.settings.read().get("policy_since", 0))
+        n_unreported = len(store.decisions.unreported_accepts(since))
+        n_unreported -= store.labels.unreported_total(since)
     for start in range(0, len(parts), CHUNK):
         chunk = parts[start : start + CHUNK]
         new: dict[str, StoredDecision] = {}
@@ -258,9 +261,8 @@ def import_parts(
                 outcome = "repeated" if label == reported.success else "contradicted"
                 counts[outcome] += label is not None
                 continue
-            stored = earlier
-            if stored is None:
-                stored = _as_stored(decision, trace, gate, policy, store.clock())
+            stored = earlier or _as_stored(decision, trace, gate, policy, store.clock())
+            if earlier is None:
                 new[decision.id] = stored
             if counts_unreported and decision.action is Action.ACCEPT:
                 # A decision that was stored without a label was counted as unreported.
@@ -269,26 +271,13 @@ def import_parts(
                 n_since = n_unreported * (not stored.quarantined)
                 n_unreported -= n_since
                 source = source_of(decision.action, decision.audit, label)
-                about = (store.clock(), stored.content_hash, stored.time)
-                labels[decision.id] = NewLabel(decision.id, label, source, 0, None, n_since, *about)
+                about = (n_since, store.clock(), stored.content_hash, stored.time)
+                labels[decision.id] = NewLabel(decision.id, label, source, 0, None, *about)
                 counts["quarantined" if stored.quarantined else "imported"] += 1
         store.apply_records([*new.values(), *labels.values()])
         if on_traces is not None:
             on_traces(len(chunk))
     return ImportReport(**counts, resumed=True)
-
-
-def _count_unreported(store: "SqlStore", policy: Policy) -> int:
-    """Return the number of unreported accepted parts since the last label that counted them.
-
-    Each label stores how many accepted parts before it had no report. Only parts since the last
-    change of the policy count. With `stops="all"` the number is 0, since the next decision confirms
-    an accepted part.
-    """
-    if policy.stops != "some":
-        return 0
-    since = int(store.settings.read().get("policy_since", 0))
-    return len(store.decisions.unreported_accepts(since)) - store.labels.unreported_total(since)
 
 
 def _as_stored(

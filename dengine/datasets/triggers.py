@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import SettingError, shortened
-from ..records import Floats
+from ..records import Floats, Ints, TraceArray
 
 Signals = Mapping[str, Floats]  # (n,) each
 MAX_STEP = 1.5  # steps from one sample to the next if none is missing
@@ -125,8 +125,8 @@ class Placed(NamedTuple):
         Number of samples that were left out because an earlier sample had their place.
     """
 
-    trace: NDArray[np.float32]
-    missing: NDArray[np.int64]
+    trace: TraceArray
+    missing: Ints
     repeated: int
 
 

@@ -70,9 +70,8 @@ def find_files(root: Path, description: Description) -> list[tuple[Path, str]]:
     """
     if root.is_file():
         return [(root, root.name)]
-    names = match_files(root, description.files)
-    names -= {source.listing for source in description.labels}
-    names -= {FOLDER_FILE, description.windows.listing}
+    listings = {source.listing for source in (*description.labels, description.windows)}
+    names = match_files(root, description.files) - listings - {FOLDER_FILE}
     for pattern in description.exclude:
         names -= {*fnmatch.filter(names, pattern)}
     if not names:

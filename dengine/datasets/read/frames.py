@@ -7,6 +7,7 @@ list of objects has a column for each of their keys.
 
 import io
 import json
+import re
 from collections.abc import Mapping
 from itertools import chain, zip_longest
 from typing import Any
@@ -42,17 +43,16 @@ def read_objects(content: bytes, source: str, form: TextForm, has_lines: bool) -
         except (ValueError, RecursionError) as error:
             do = "" if has_lines else '; if each line is an object, state format="jsonl"'
             raise UnreadableError(f"Expected JSON: {error}{do}", number) from error
-        items = value if isinstance(value, list) else [value]
-        for item in items:
+        for item in value if isinstance(value, list) else [value]:
             if not isinstance(item, Mapping):
                 raise UnreadableError(f"Expected an object of JSON, got {shortened(item)}", number)
             rows.append(flat("", item))
-        numbers += [number] * len(items)
+            numbers.append(number)
     if not rows:
         raise UnreadableError("Expected objects of JSON, got none")
     names = dict.fromkeys(chain(*rows))
     columns = {name: as_cells([row.get(name) for row in rows]) for name in names}
-    return Table(source, columns, numbers)
+    return Table(source, columns, np.array(numbers))
 
 
 def flat(prefix: str, value: Mapping[str, Any]) -> dict[str, Any]:
@@ -129,7 +129,7 @@ def read_frame(frame: Any, source: str) -> Table:
     `source` is the table's name in errors. Rows are numbered from 1. Raises ValueError if the index
     is named like a column.
     """
-    frame = frame.reset_index() if frame.index.name is not None else frame
+    frame = frame.reset_index(drop=frame.index.name is None)
     columns = {str(name): frame[name].to_numpy() for name in frame.columns}
     return Table(source, columns, np.arange(1, len(frame) + 1))
 
@@ -180,11 +180,10 @@ def read_ts(content: bytes, source: str, form: TextForm) -> Table:
     ----------
     Middlehurst et al. (2024), aeon: a Python toolkit for learning from time series, JMLR 25(289).
     """
-    lines = to_utf8(content, form.encoding).decode().split("\n")
-    heads = [line.strip().lower() for line in lines]
-    first = heads.index("@data") + 1 if "@data" in heads else len(lines)
-    below = enumerate(lines[first:], first + 1)
-    rows = {i: line.strip().rpartition(":") for i, line in below if line.strip()}
+    text = to_utf8(content, form.encoding).decode()
+    head, *below = re.split(r"(?im)^[ \t]*@data[ \t]*$", text, maxsplit=1)
+    lines = enumerate("".join(below).split("\n"), head.count("\n") + 1)
+    rows = {i: line.strip().rpartition(":") for i, line in lines if line.strip()}
     if not rows:
         raise UnreadableError("Expected series below a line @data, got none")
     series = (channels.split(":") for channels, _, _ in rows.values())

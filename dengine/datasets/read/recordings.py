@@ -11,10 +11,9 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from ...errors import DataError, instead, listed
-from ...records import FITS, Floats
+from ...records import FITS, Floats, TraceArray
 from ...traces import can_fit_length, fit_length
 from ..checks import check_description, lost_note, without_repeats
 from ..dataset import Dataset, Fault, make_dataset, unit_text
@@ -301,9 +300,7 @@ def dataset_of(recordings: Sequence[Recording], description: Description) -> Dat
     )
 
 
-def fitted(
-    samples: Floats, seconds: Floats | None, description: Description
-) -> NDArray[np.float32]:
+def fitted(samples: Floats, seconds: Floats | None, description: Description) -> TraceArray:
     """Return the trace (C, T) of samples (C, n), brought to T samples as `[traces]` says.
 
     `seconds`, shape (n,), has the times since the first sample; None without a clock. With
