@@ -4,7 +4,7 @@ Recordings with equal samples and different labels are faults, and so is each re
 `tolerance_note` compares the tolerance of a policy with the share of bad parts.
 """
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Sequence
 from zoneinfo import ZoneInfo
 
@@ -117,10 +117,9 @@ def lost_note(recordings: Sequence[Recording]) -> str:
 
     It says how many samples are lost, in how many recordings, and names up to eight of these.
     """
-    n_lost = {item.source: int((~np.isfinite(item.trace)).sum()) for item in recordings}
-    lost = [source for source, n in n_lost.items() if n]
+    lost = +Counter({item.source: int((~np.isfinite(item.trace)).sum()) for item in recordings})
     where = f"in {len(lost)} of {len(recordings)} recordings: {listed(lost)}"
-    return f"{sum(n_lost.values())} samples are lost, {where}." if lost else ""
+    return f"{lost.total()} samples are lost, {where}." if lost else ""
 
 
 def tolerance_note(data: Dataset, lower_bound: float) -> str:

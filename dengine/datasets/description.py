@@ -12,7 +12,7 @@ import difflib
 import re
 import sys
 import tomllib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
@@ -414,10 +414,9 @@ class Description:
         counted. In `[[check]]` it is a word that no recording has, and recordings with other words
         become faults.
         """
-        values = self.to_dict()
-        values.pop("ignored", None)
-        open_channels = ["channels"] if UNKNOWN in values["channels"] else []
-        return (*_open_keys(values), *open_channels)
+        values = flat("", {**self.to_dict(), "ignored": {}})
+        keys = [k for k, v in values.items() if UNKNOWN in (v if isinstance(v, list) else [v])]
+        return tuple(keys if self.channels else [*keys, "channels"])
 
     def with_values(self, stated: Stated) -> "Description":
         """Return a description in which the given keys, like `label.column`, have these values.
@@ -564,13 +563,18 @@ def _plain(value: Any) -> Any:
     return {k: _plain(v) for k, v in values.items() if v != getattr(default, k)}
 
 
-def _open_keys(values: Stated, prefix: str = "") -> Iterator[str]:
-    """Yield each key of nested dicts, like `label.column`, that is `?` or a list that has `?`."""
-    for name, value in values.items():
-        if isinstance(value, Mapping):
-            yield from _open_keys(value, f"{prefix}{name}.")
-        elif value == UNKNOWN or (isinstance(value, list) and UNKNOWN in value):
-            yield prefix + name
+def flat(prefix: str, value: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a nested mapping as one dict: `{"a": {"b": 1}}` becomes `{"a.b": 1}`.
+
+    An empty mapping within it is left out. If two keys become equal, the later one counts.
+
+    prefix : text that is put before each key. value : the mapping.
+    """
+    items: dict[str, Any] = {}
+    for name, item in value.items():
+        is_nested = isinstance(item, Mapping)
+        items |= flat(f"{prefix}{name}.", item) if is_nested else {f"{prefix}{name}": item}
+    return items
 
 
 def _toml_key(name: str) -> str:

@@ -25,7 +25,6 @@ from .split import signals_of, verdicts_of
 SUFFIX = ".mcap"
 STAMP, LOG_TIME = "stamp", "log_time"
 Message = tuple[str, int, Any]  # topic, nanoseconds of the log, message
-Files = Sequence[tuple[Path, str]]
 Events = dict[str, list[tuple[int, Any]]]  # by topic: nanoseconds of the log, data
 
 
@@ -61,7 +60,9 @@ def read_messages(path: Path, topics: Collection[str] | None) -> Iterator[Messag
         ) from error
 
 
-def read_bag(files: Files, title: str, description: Description, faults: list[Fault]) -> Table:
+def read_bag(
+    base: Path, names: Sequence[str], title: str, description: Description, faults: list[Fault]
+) -> Table:
     """Return a table with a row for each message that has the channels, in the order of `log_time`.
 
     Its columns are the channels, `log_time`, the time of the log, and `stamp`, that in the
@@ -73,8 +74,10 @@ def read_bag(files: Files, title: str, description: Description, faults: list[Fa
 
     Parameters
     ----------
-    files : sequence of (Path, str)
-        The files of the bag in their order, each with its name for error messages.
+    base : Path
+        The folder of the bag.
+    names : sequence of str
+        The files of the bag in their order.
     title : str
         The bag's name in error messages.
     description : Description
@@ -99,7 +102,22 @@ def read_bag(files: Files, title: str, description: Description, faults: list[Fa
     verdicts = verdicts_of(description)
     others = verdicts.union(description.part.column, signals_of(description), [description.order])
     events: Events = {name: [] for name in others if name.startswith("/") and "." not in name}
-    rows = _rows_of(files, description, topics, events, faults)
+    fields = [attrgetter(column.partition(".")[2]) for column in columns]
+    rows: list[Any] = []
+    for name in names:
+        if description.windows.trigger and faults:
+            raise DataError(
+                f"Expected whole files before {name}, since a trigger cuts: {faults[0]}"
+            )
+        with caught(faults, name), instead(UnreadableError, "Expected a field", AttributeError):
+            for topic, logged, message in read_messages(base / name, {*topics, *events}):
+                if topic in events:
+                    events[topic].append((logged, message.data))
+                if topic in topics:
+                    rows.append((logged, _stamp_of(message), *(field(message) for field in fields)))
+    if not rows:
+        why = f" {faults[0]}." if faults else ""
+        raise DataError(f"Expected messages of {listed(topics)}, found none.{why}")
     rows.sort(key=itemgetter(0))
     cells = map(as_cells, zip(*rows, strict=True))
     table = dict(zip((LOG_TIME, STAMP, *columns), cells, strict=True))
@@ -108,42 +126,10 @@ def read_bag(files: Files, title: str, description: Description, faults: list[Fa
     return Table(title, table, [])
 
 
-def _rows_of(
-    files: Files,
-    description: Description,
-    topics: set[str],
-    events: Events,
-    faults: list[Fault],
-) -> list[Any]:
-    """Return a row (log time, header time, *values) of each message with the channels.
-
-    Times are in nanoseconds; the header time is 0 without a header. The values are the fields that
-    are the channels. `files` has the path and the name in errors of each file, and `topics` the
-    topic of the channels. Messages of topics that are keys of `events` are appended there as (log
-    time, data); others are not read. For a file that cannot be read or is damaged, or has a message
-    that lacks a field, a fault is appended to `faults`, and what came before stays. Raises
-    DataError if no message has the channels, or if a trigger cuts the bag and `faults` has any
-    before its last file.
-    """
-    fields = [attrgetter(column.partition(".")[2]) for column in description.channels]
-    rows: list[Any] = []
-    for path, name in files:
-        if description.windows.trigger and faults:
-            raise DataError(
-                f"Expected whole files before {name}, since a trigger cuts: {faults[0]}"
-            )
-        with caught(faults, name), instead(UnreadableError, "Expected a field", AttributeError):
-            for topic, logged, message in read_messages(path, {*topics, *events}):
-                if topic in events:
-                    events[topic].append((logged, message.data))
-                if topic in topics:
-                    stamp = getattr(getattr(message, "header", None), "stamp", None)
-                    stamped = stamp.sec * 10**9 + stamp.nanosec if stamp else 0
-                    rows.append((logged, stamped, *(field(message) for field in fields)))
-    if not rows:
-        why = f" {faults[0]}." if faults else ""
-        raise DataError(f"Expected messages of {listed(topics)}, found none.{why}")
-    return rows
+def _stamp_of(message: Any) -> int:
+    """Return the time in a message's header, in nanoseconds; 0 without a header."""
+    stamp = getattr(getattr(message, "header", None), "stamp", None)
+    return stamp.sec * 10**9 + stamp.nanosec if stamp else 0
 
 
 def _cells_of(messages: list[tuple[int, Any]], logs: Cells, is_verdict: bool) -> Cells:

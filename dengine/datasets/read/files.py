@@ -60,16 +60,16 @@ def match_files(root: Path, patterns: Sequence[str]) -> set[str]:
     return {path.relative_to(root).as_posix() for path in paths if path.is_file()}
 
 
-def find_files(root: Path, description: Description) -> list[tuple[Path, str]]:
-    """Return the path of each file that a description names, with its path relative to the folder.
+def find_files(root: Path, description: Description) -> list[str]:
+    """Return the files that a description names, as paths relative to the folder.
 
     They are sorted by file name, run_2 before run_10. Listings, the description file and files that
-    match a pattern in `exclude` are left out. If `root` is a file, only that is returned, with its
-    name, whatever the description says. Raises DataError if no file is left, or for a malformed
-    pattern in `files`.
+    match a pattern in `exclude` are left out. If `root` is a file, its name alone is returned,
+    whatever the description says. Raises DataError if no file is left, or for a malformed pattern
+    in `files`.
     """
     if root.is_file():
-        return [(root, root.name)]
+        return [root.name]
     listings = {source.listing for source in (*description.labels, description.windows)}
     names = match_files(root, description.files) - listings - {FOLDER_FILE}
     for pattern in description.exclude:
@@ -79,8 +79,7 @@ def find_files(root: Path, description: Description) -> list[tuple[Path, str]]:
             f"Expected files {', '.join(description.files)} in {root}, found none; is it the "
             f"description of another folder? See `dengine data {root}`."
         )
-    files = [(root / name, name) for name in names]
-    return sorted(files, key=lambda item: (natural_key(item[0].name), natural_key(item[1])))
+    return sorted(names, key=lambda name: (natural_key(Path(name).name), natural_key(name)))
 
 
 def read_file(path: Path) -> bytes:

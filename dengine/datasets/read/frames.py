@@ -16,7 +16,7 @@ import numpy as np
 
 from ...errors import instead, shortened
 from ...files import read_archive, read_errors
-from ..description import TextForm
+from ..description import TextForm, flat
 from ..table import Cells, Table, UnreadableError
 from .text import to_utf8
 
@@ -53,20 +53,6 @@ def read_objects(content: bytes, source: str, form: TextForm, has_lines: bool) -
     names = dict.fromkeys(chain(*rows))
     columns = {name: as_cells([row.get(name) for row in rows]) for name in names}
     return Table(source, columns, np.array(numbers))
-
-
-def flat(prefix: str, value: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a nested mapping as one dict: `{"a": {"b": 1}}` becomes `{"a.b": 1}`.
-
-    An empty mapping within it is left out. If two keys become equal, the later one counts.
-
-    prefix : text that is put before each key. value : the mapping.
-    """
-    items: dict[str, Any] = {}
-    for name, item in value.items():
-        is_nested = isinstance(item, Mapping)
-        items |= flat(f"{prefix}{name}.", item) if is_nested else {f"{prefix}{name}": item}
-    return items
 
 
 def columns_of(prefix: str, value: Any) -> Columns:
@@ -159,10 +145,9 @@ def read_npz(content: bytes, source: str, has_all: bool) -> Table:
     arrays, _ = read_archive(content, name=source)
     if not arrays:
         raise UnreadableError("Expected arrays, got none")
+    columns = {k: np.atleast_1d(x if has_all else np.squeeze(x)) for k, x in arrays.items()}
     if not has_all:
-        squeezed = {name: np.atleast_1d(np.squeeze(x)) for name, x in arrays.items()}
-        return Table(source, columns_of("", squeezed), [])
-    columns = {name: np.atleast_1d(x) for name, x in arrays.items()}
+        return Table(source, columns_of("", columns), [])
     n = len(max(columns.values(), key=np.size))
     return Table(source, columns, range(1, n + 1))
 

@@ -4,10 +4,10 @@ header, or in a listing, which is a file with a row for each recording or part.
 
 import re
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 from ...errors import DataError, instead, listed, shortened
 from ..dataset import Fault
@@ -139,7 +139,7 @@ class LabelReader:
     """
 
     source: LabelSource
-    listing: defaultdict[str, list[str]] = field(default_factory=lambda: defaultdict(list))
+    listing: Mapping[str, Sequence[str]]
     used: set[str] = field(default_factory=set)
 
     def words(self, table: Table, part: str) -> Sequence[str]:
@@ -163,7 +163,7 @@ class LabelReader:
         path = table.path
         if not source.listing:
             return words_of(source, table, [source.column or source.topic], source.at)
-        name = PurePosixPath(path).name
+        name = path.rpartition("/")[2]
         names = filter(None, (part, path, name, without_suffix(path), without_suffix(name)))
         keys = [key for key in map(as_key, names) if key in self.listing]
         if not keys:
@@ -228,7 +228,7 @@ def read_labels(base: Path, source: LabelSource, form: TextForm) -> LabelReader:
     and there, and LookupError for an encoding that Python does not know. A path that is no valid
     expression is not noticed here.
     """
-    reader = LabelReader(source)
+    listing = defaultdict[str, list[str]](list)
     if source.listing:
         columns = (source.key, source.column)
         if not all(columns):
@@ -236,5 +236,5 @@ def read_labels(base: Path, source: LabelSource, form: TextForm) -> LabelReader:
         with in_listing(source.listing):
             table = listing_table(base / source.listing, form)
             for key, word in zip(*map(table.words, columns), strict=True):
-                reader.listing[as_key(key)].append(word)
-    return reader
+                listing[as_key(key)].append(word)
+    return LabelReader(source, listing)

@@ -5,7 +5,7 @@ a `Dataset`. What does not follow the description becomes a `Fault`.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -107,8 +107,7 @@ def kept_rows(table: Table, rows: Mapping[str, RowWords]) -> tuple[Table, Cells]
     n = max(map(len, table.columns.values()), default=0)
     is_lost: Cells = np.zeros(n, dtype=bool)
     for column, about in rows.items():
-        kinds = {"keep": about.keep, "drop": about.drop, "invalid": about.invalid}
-        kind_of = {word: kind for kind, words in kinds.items() for word in words}
+        kind_of = {word: kind for kind, words in asdict(about).items() for word in words}
         other = kind_of.get(ANY, "")
         words = table.words(column).tolist()
         kind = np.array([kind_of.get(word, other) for word in words], dtype=object)
@@ -197,9 +196,9 @@ def read_recordings(
     labels = [read_labels(base, label, description.text) for label in description.labels]
     recordings: list[Recording] = []
     n_unlabelled = 0
-    for file, title in files:
-        with caught(faults, title):
-            for part in parts_of(file, title, description, base):
+    for file in files:
+        with caught(faults, file.source if isinstance(file, Table) else file):
+            for part in parts_of(file, description, base):
                 with caught(faults, part.source):
                     recording = recording_of(part, description, labels)
                     recordings += [recording] if recording else []
@@ -232,8 +231,8 @@ def read_recordings(
 
 def files_of(
     source: Any, description: Description, faults: list[Fault]
-) -> tuple[str, Path, Sequence[tuple[Path | Table, str]]]:
-    """Return the name of a data set, its folder, and a list of (file or table, name) to read.
+) -> tuple[str, Path, Sequence[str | Table]]:
+    """Return the name of a data set, its folder, and what to read: files in it, or a table.
 
     The data set has the name of the folder, or of the file without its suffix. All files of a bag
     are read here, into one table; a fault of each damaged one is appended to `faults`. A DataFrame
@@ -242,29 +241,29 @@ def files_of(
     `windows.trigger` of a bag is malformed.
     """
     if not isinstance(source, Path):
-        return FRAME, Path(), [(read_frame(source, FRAME), FRAME)]
+        return FRAME, Path(), [read_frame(source, FRAME)]
     is_folder = source.is_dir()
     name = source.resolve().name if is_folder else source.stem
-    files: Any = find_files(source, description)
-    if description.layout == "mcap":
-        title = files[0][1] if len(files) == 1 else name
-        files = [(read_bag(files, title, description, faults), title)]
-    return name, source if is_folder else source.parent, files
+    base = source if is_folder else source.parent
+    files = find_files(source, description)
+    if description.layout != "mcap":
+        return name, base, files
+    title = files[0] if len(files) == 1 else name
+    return name, base, [read_bag(base, files, title, description, faults)]
 
 
-def parts_of(
-    file: Path | Table, name: str, description: Description, base: Path
-) -> Iterator[Table]:
+def parts_of(file: str | Table, description: Description, base: Path) -> Iterator[Table]:
     """Yield the tables of the parts in a file, or in a table that was read already.
 
     Each table that `split` yields is one part, or, if `[windows]` is stated, a long recording that
-    is cut into parts. `name` is the file's name in errors, and `base` the folder of the listing in
-    `[windows]`. Raises UnreadableError or DataError if the file cannot be read, DataError if it
-    cannot be split, or one of its recordings cannot be cut (those before it are yielded), and
-    SettingError if `windows.trigger` is malformed.
+    is cut into parts. `base` is the folder of the file, and of the listing in `[windows]`. Raises
+    UnreadableError or DataError if the file cannot be read, DataError if it cannot be split, or one
+    of its recordings cannot be cut (those before it are yielded), and SettingError if
+    `windows.trigger` is malformed.
     """
-    table = file if isinstance(file, Table) else table_of(read_file(file), name, description)
-    for part in split(table, description):
+    if not isinstance(file, Table):
+        file = table_of(read_file(base / file), file, description)
+    for part in split(file, description):
         yield from cut(part, description, base) if description.is_cut else [part]
 
 
@@ -321,17 +320,15 @@ def fitted(samples: Floats, seconds: Floats | None, description: Description) ->
     n = samples.shape[1]
     kind = FITS.index(about.lengths.removesuffix("-all"))
     can_fit = can_fit_length(n, about.samples, kind) or (about.lengths == "pad-all" and n > 0)
-    times = None
     if about.lengths == "resample" and seconds is not None:
         times = np.linspace(0, seconds[-1], about.samples)
         if rate:
             times = np.arange(about.samples) / rate
             can_fit = bool(times[-1] <= seconds[-1] + (1 + ROUNDING) / rate)
-    if not can_fit:
-        raise UnreadableError(
-            f"Expected {about.samples} samples, got {n}; see traces.lengths, which is "
-            f"{about.lengths}"
-        )
-    if times is not None and seconds is not None:
-        return np.stack([np.interp(times, seconds, row) for row in samples]).astype(np.float32)
-    return fit_length(torch.from_numpy(samples.astype(np.float32)), about.samples, kind).numpy()
+        if can_fit:
+            return np.stack([np.interp(times, seconds, row) for row in samples]).astype(np.float32)
+    elif can_fit:
+        return fit_length(torch.from_numpy(samples.astype(np.float32)), about.samples, kind).numpy()
+    raise UnreadableError(
+        f"Expected {about.samples} samples, got {n}; see traces.lengths, which is {about.lengths}"
+    )
