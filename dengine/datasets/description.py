@@ -380,13 +380,13 @@ class Description:
         """Return the lines of one section of the TOML file; the note on a key stands above it.
 
         Notes on keys that the section does not have come first. Empty notes are left out; a
-        character that does not print becomes a blank.
+        control character becomes a blank.
 
         prefix : the name of the section with a dot, like `label.`, with which the keys of its notes
         begin; "" for the keys outside of all sections. table : the values of the section by key.
         """
         notes = {
-            key.removeprefix(prefix): "".join(c if c.isprintable() else " " for c in note)
+            key.removeprefix(prefix): re.sub(r"[\x00-\x1f\x7f]", " ", note)
             for key, note in self.notes.items()
             if note and key.startswith(prefix) and (prefix or key.partition(".")[0] not in SECTIONS)
         }

@@ -21,6 +21,7 @@ from ..table import Cells, Table, UnreadableError
 from .text import to_utf8
 
 DAMAGES = (LookupError, TypeError, ValueError)  # of lists of several forms
+ITEMS = (list, np.ndarray)
 Columns = dict[str, Cells]
 
 
@@ -69,30 +70,32 @@ def columns_of(prefix: str, value: Any) -> Columns:
     """
     if isinstance(value, np.ndarray) and value.dtype == object:
         value = value.tolist()
-    items = value if isinstance(value, list | np.ndarray) else [value]
-    is_object = isinstance(value, Mapping)
     with instead(UnreadableError, f"Expected items of one form in {prefix}", *DAMAGES):
-        nested = value if is_object else _turned(items)
-    columns: Columns = {} if nested or is_object else {prefix: as_cells(items)}
+        nested = _turned(value)
+    if nested is None:
+        return {prefix: as_cells(value if isinstance(value, ITEMS) else [value])}
+    columns: Columns = {}
     for name, item in nested.items():
         columns |= columns_of(f"{prefix}.{name}" if prefix else str(name), item)
     return columns
 
 
-def _turned(items: Any) -> Mapping[Any, Any]:
+def _turned(value: Any) -> Mapping[Any, Any] | None:
     """Return a list of mappings as a list for each key, or a list of lists as one for each channel.
 
-    The shorter axis of a list of lists is the channels, which are numbered from 0. The result is
-    empty if the first item is neither, or there is none. Keys that the first mapping lacks are left
-    out. Raises LookupError, TypeError or ValueError if an item lacks a key of the first, is of
-    another kind or has another length.
+    The shorter axis of a list of lists is the channels, which are numbered from 0. A mapping is
+    returned as it is, and None for any other value, also an empty list. Keys that the first mapping
+    of a list lacks are left out. Raises LookupError, TypeError or ValueError if an item lacks a key
+    of the first, is of another kind or has another length.
     """
-    first = items[0] if len(items) else None
+    if isinstance(value, Mapping):
+        return value
+    first = value[0] if isinstance(value, ITEMS) and len(value) else None
     if isinstance(first, Mapping):
-        return {key: [item[key] for item in items] for key in first}
-    if not isinstance(first, list | np.ndarray):
-        return {}
-    x = np.array(items, dtype=object)
+        return {key: [item[key] for item in value] for key in first}
+    if not isinstance(first, ITEMS):
+        return None
+    x = np.array(value, dtype=object)
     return dict(enumerate(x if len(x) <= x.shape[1] else x.swapaxes(0, 1)))
 
 

@@ -98,6 +98,7 @@ def split(table: Table, description: Description) -> Iterator[Table]:
     without `time.sort`; in `columns` and for a whole file, if the file has any. Raises DataError if
     `part.column` of the layout `long` is not stated or not in the table.
     """
+    table = replace(table, path=table.source)
     if description.layout == "long":
         yield from _split_rows(table, description)
     elif description.layout == "columns":
@@ -105,7 +106,7 @@ def split(table: Table, description: Description) -> Iterator[Table]:
     elif description.layout in ("wide", "npz") or description.format in OBJECTS:
         yield from _split_wide(table, description)
     else:
-        yield replace(table, path=table.source)
+        yield table
 
 
 def _split_rows(table: Table, description: Description) -> Iterator[Table]:
@@ -133,7 +134,7 @@ def _split_rows(table: Table, description: Description) -> Iterator[Table]:
             message = "Expected the rows of a part together, others stand between them"
             damage.append(UnreadableError(message, table.line(breaks[0]), columns[0]))
         source = f"{table.source}, {' '.join(key)}"
-        yield replace(table.take(rows), source=source, path=table.source, damage=damage)
+        yield replace(table.take(rows), source=source, damage=damage)
 
 
 def _split_wide(table: Table, description: Description) -> Iterator[Table]:
@@ -173,12 +174,13 @@ def _row_of(table: Table, i: int) -> Table:
     line = table.lines[i]
     source = f"{table.source}, row {line or i + 1}" if n > 1 else table.source
     damage = [error for error in table.damage if error.line == line]
-    part = replace(table, source=source, path=table.source, lines=[line], damage=damage)
     row = {name: cells[i] if len(cells) == n else cells for name, cells in table.columns.items()}
+    columns: frames.Columns = {}
     try:
-        return replace(part, columns=frames.columns_of("", row))
+        columns = frames.columns_of("", row)
     except UnreadableError as error:
-        return replace(part, columns={}, damage=[error])
+        damage = [error]
+    return replace(table, source=source, columns=columns, lines=[line], damage=damage)
 
 
 def match_numbered(key: str, columns: Iterable[str]) -> list[re.Match[str]]:
