@@ -8,7 +8,6 @@ other ids. `export.cell_journal` imports the journals of exported cells by `impo
 """
 
 import math
-import os
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -82,11 +81,10 @@ def check_agreement(data: Dataset, trace_spec: TraceSpec) -> None:
     """
     spec = data.spec
     is_resampled = {item.fit == "resample" for item in (spec, trace_spec)}
-    is_fitted = len(is_resampled) == 1 and spec.samples == trace_spec.samples
     wanted = f"recordings brought to {trace_spec.samples} samples by {trace_spec.fit}"
     do = "state these in [traces], or what is known would count again"
-    is_fitted = is_fitted or data.lengths is None
-    expect(is_fitted, wanted, (spec.samples, spec.fit), do, TraceError)
+    is_same = len(is_resampled) == 1 and spec.samples == trace_spec.samples
+    expect(data.lengths is None or is_same, wanted, (spec.samples, spec.fit), do, TraceError)
     rates = (trace_spec.rate_hz, spec.rate_hz)
     is_rate = None in rates or math.isclose(*rates, rel_tol=RATE_TOLERANCE)  # type: ignore[arg-type]
     expect(is_rate, f"traces at {rates[0]} Hz", rates[1], "resample them", TraceError)
@@ -193,7 +191,7 @@ def import_labelled(
         parts = list(zip(decisions, traces, map(as_success, data.y), strict=True))
         report = import_parts(engine.store, parts, trace_spec, engine.policy, on_traces)
     finally:
-        if isinstance(store, str | os.PathLike):
+        if opened is not store:
             engine.close()
     return replace(report, resumed=engine.resumed)
 
@@ -261,9 +259,9 @@ def import_parts(
                 outcome = "repeated" if label == reported.success else "contradicted"
                 counts[outcome] += label is not None
                 continue
-            stored = earlier or _as_stored(decision, trace, gate, policy, store.clock())
-            if earlier is None:
-                new[decision.id] = stored
+            stored = earlier or new.setdefault(
+                decision.id, _as_stored(decision, trace, gate, policy, store.clock())
+            )
             if counts_unreported and decision.action is Action.ACCEPT:
                 # A decision that was stored without a label was counted as unreported.
                 n_unreported += (label is None) - (earlier is not None)

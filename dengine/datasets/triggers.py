@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from ..errors import SettingError, shortened
 from ..records import Floats, Ints, TraceArray
 
-Signals = Mapping[str, Floats]  # (n,) each
 MAX_STEP = 1.5  # steps from one sample to the next if none is missing
 
 
@@ -51,7 +50,7 @@ class Trigger:
         vector = (f"{self.signal}[0]", f"{self.signal}[1]", f"{self.signal}[2]")
         return vector if self.kind == "motion" else (self.signal,)
 
-    def active(self, signals: Signals) -> NDArray[np.bool_]:
+    def active(self, signals: Mapping[str, Floats]) -> NDArray[np.bool_]:
         """Return whether the condition is met at each sample, (n,) bool; False if a signal is NaN.
 
         signals : arrays of shape (n,) by the names of the signals.
@@ -141,7 +140,7 @@ class Start(NamedTuple):
     """
 
     time: float
-    seen: bool = True
+    seen: bool
 
 
 class StartFinder:
@@ -186,7 +185,7 @@ class StartFinder:
         if off_since is None or time - off_since < self.quiet_s - self.step / 2:
             return None
         seen = time - self._last_off < MAX_STEP * self.step
-        return Start(time) if seen else Start(self._last_off + self.step, seen=False)
+        return Start(time if seen else self._last_off + self.step, seen)
 
 
 def place(

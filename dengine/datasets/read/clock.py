@@ -16,7 +16,6 @@ ISO = "iso"
 DAY = UNITS["d"]
 RATE_TOLERANCE = 0.03  # by which the rate of a recording's own times may differ from the stated one
 DATES = re.compile(r"%[dDjeyYxcmbB]")
-WHOLE = re.compile(r"-?\d{1,18}", re.ASCII)
 Times = tuple[Floats, float]  # the seconds of each row since the first, and the time of the first
 
 
@@ -161,8 +160,8 @@ def check_steps(seconds: Floats, clock: Clock, table: Table) -> None:
     n = len(steps)
     span = float(seconds[-1] - seconds[0])
     most = clock.gap / rate if rate else clock.gap * span / max(n, 1)
-    is_equal = (steps == 0) & (clock.gap > 0 or span == 0)
-    is_bad = (steps < 0) | is_equal | (steps > (most or np.inf))
+    is_bad = steps <= 0 if clock.gap or not span else steps < 0
+    is_bad |= steps > (most or np.inf)
     if is_bad.any():
         row = int(is_bad.argmax()) + 1
         raise UnreadableError(

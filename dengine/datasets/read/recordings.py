@@ -276,16 +276,16 @@ def dataset_of(recordings: Sequence[Recording], description: Description) -> Dat
     "pad-all". `limit` is that of the first channel. `part` is None if no recording has a part
     number. Raises DataError if `make_dataset` refuses the traces.
     """
-    labels, parts, sources, lengths = (
+    X, labels, parts, sources, lengths = (
         np.array([getattr(recording, key) for recording in recordings])
-        for key in ("label", "part", "source", "length")
+        for key in ("trace", "label", "part", "source", "length")
     )
     channels = [*description.channels.values()]
     clock = description.time
     fit = description.traces.lengths.removesuffix("-all")
     is_grid = fit == "resample" and clock.column and clock.rate_hz
     return make_dataset(
-        np.stack([recording.trace for recording in recordings]),
+        X,
         labels,
         rate_hz=clock.rate_hz or None,
         unit=unit_text([channel.unit for channel in channels]),

@@ -102,12 +102,9 @@ def _listed(table: Table, times: Floats, description: Description, base: Path) -
             clock = Clock((column,), (about.format,), description.time.zone)
             seconds, start = times_of(listing, clock, form)
             bounds.append(seconds + (start - TOLERANCE))
-    begins, ends = bounds
     margin = 1.5 / (description.time.rate_hz or np.inf) + TOLERANCE
     latest = -np.inf
-    for i in np.argsort(begins, kind="stable"):
-        begin = begins[i]
-        end = ends[i]
+    for begin, end, key in sorted(zip(*bounds, keys.tolist(), strict=True)):
         rows = np.flatnonzero((times >= begin) & (times < end))
         fault = ""
         if begin < latest - TOLERANCE:
@@ -116,4 +113,4 @@ def _listed(table: Table, times: Floats, description: Description, base: Path) -
             fault = "Expected samples in the whole window, it has none or goes beyond the recording"
         latest = max(latest, end)
         window = slice(rows[0], rows[-1] + 1) if len(rows) else slice(0, 1)
-        yield str(keys[i]), window, fault
+        yield key, window, fault
