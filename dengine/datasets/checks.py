@@ -4,7 +4,7 @@ Recordings with equal samples and different labels are faults, and so is each re
 `tolerance_note` compares the tolerance of a policy with the share of bad parts.
 """
 
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import Sequence
 from zoneinfo import ZoneInfo
 
@@ -110,16 +110,6 @@ def without_repeats(recordings: Sequence[Recording]) -> tuple[list[Recording], l
         faults |= {id(item): Fault(item.source, 0, message) for item in repeats}
     kept = [recording for recording in recordings if id(recording) not in faults]
     return kept, [*faults.values()]
-
-
-def lost_note(recordings: Sequence[Recording]) -> str:
-    """Return a sentence on lost samples, which are NaN or infinite; "" if no recording has any.
-
-    It says how many samples are lost, in how many recordings, and names up to eight of these.
-    """
-    lost = +Counter({item.source: int((~np.isfinite(item.trace)).sum()) for item in recordings})
-    where = f"in {len(lost)} of {len(recordings)} recordings: {listed(lost)}"
-    return f"{lost.total()} samples are lost, {where}." if lost else ""
 
 
 def tolerance_note(data: Dataset, lower_bound: float) -> str:

@@ -128,7 +128,7 @@ class Dataset:
         return len(self.y)
 
     @property
-    def cube(self) -> NDArray[np.float32]:
+    def cube(self) -> TraceArray:
         """The traces, shape (n, C, T) also for a single channel."""
         return self.X if self.X.ndim == 3 else self.X[:, None]
 
@@ -139,8 +139,9 @@ class Dataset:
         A rate or a unit that is unknown is None.
         """
         _, channels, samples = self.cube.shape
-        about = (self.rate_hz, channels, self.unit, self.limit, self.fit, self.channels)
-        return TraceSpec(samples, *about)
+        return TraceSpec(
+            samples, self.rate_hz, channels, self.unit, self.limit, self.fit, self.channels
+        )
 
     def to_frame(self) -> "pd.DataFrame":
         """Return a DataFrame with a row for each trace.
@@ -204,7 +205,7 @@ def make_dataset(
     y: ArrayLike,
     *,
     rate_hz: float | None = None,
-    channels: Names = (),
+    channels: Sequence[str] = (),
     part: Any = None,
     cause: Any = None,
     **about: Any,
@@ -268,7 +269,7 @@ def make_dataset(
         cube[:, 0] if n_channels == 1 else cube,
         y.astype(np.int8),
         rate_hz=rate_hz,
-        channels=channels,
+        channels=tuple(channels),
         part=None if parts is None else parts.astype(np.str_),
         cause=cause,
         **about,

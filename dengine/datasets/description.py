@@ -572,8 +572,10 @@ def flat(prefix: str, value: Mapping[str, Any]) -> dict[str, Any]:
     """
     items: dict[str, Any] = {}
     for name, item in value.items():
-        is_nested = isinstance(item, Mapping)
-        items |= flat(f"{prefix}{name}.", item) if is_nested else {f"{prefix}{name}": item}
+        if isinstance(item, Mapping):
+            items |= flat(f"{prefix}{name}.", item)
+        else:
+            items[f"{prefix}{name}"] = item
     return items
 
 
@@ -588,9 +590,9 @@ def _toml_value(value: Any) -> str:
     A dict is written in one line, `{ unit = "N", factor = 2.0 }`; but if it has only a unit, as
     this text. A list of one item is written as that item.
     """
-    if isinstance(value, Mapping) and {*value} == {"unit"}:
-        return _toml_value(value["unit"])
     if isinstance(value, Mapping):
+        if {*value} == {"unit"}:
+            return _toml_value(value["unit"])
         pairs = (f"{_toml_key(name)} = {_toml_value(item)}" for name, item in value.items())
         return f"{{ {', '.join(pairs)} }}"
     if isinstance(value, list) and len(value) == 1:

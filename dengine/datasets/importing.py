@@ -269,8 +269,17 @@ def import_parts(
                 n_since = n_unreported * (not stored.quarantined)
                 n_unreported -= n_since
                 source = source_of(decision.action, decision.audit, label)
-                about = (n_since, store.clock(), stored.content_hash, stored.time)
-                labels[decision.id] = NewLabel(decision.id, label, source, 0, None, *about)
+                labels[decision.id] = NewLabel(
+                    decision.id,
+                    label,
+                    source,
+                    0,
+                    None,
+                    n_since,
+                    store.clock(),
+                    stored.content_hash,
+                    stored.time,
+                )
                 counts["quarantined" if stored.quarantined else "imported"] += 1
         store.apply_records([*new.values(), *labels.values()])
         if on_traces is not None:

@@ -240,11 +240,12 @@ def _from_own_frame(frame: Any, name: str = "table") -> Dataset:
     its arrays, KeyError if it has no longer a column `label`, and ValueError if columns of samples
     are no numbers or their number is not that of `attrs`.
     """
-    about = frame.attrs[OWN]
+    about = {**frame.attrs[OWN]}
     words = frame[frame.columns.intersection(["part", "cause"])].astype(str)
     X = frame.drop(columns=["label", *words]).to_numpy(np.float32)
-    arrays = {**about, "X": X.reshape(len(X), about["n_channels"], -1), "y": frame["label"]}
-    return _from_arrays(arrays | {key: words[key].to_numpy(np.str_) for key in words}, name)
+    X = X.reshape(len(X), about.pop("n_channels"), -1)
+    about |= {key: words[key].to_numpy(np.str_) for key in words}
+    return make_dataset(X, frame["label"], name=name, **about)
 
 
 def _read_npz(path: Path) -> Dataset:
@@ -256,34 +257,22 @@ def _read_npz(path: Path) -> Dataset:
     """
     arrays, _ = read_archive(path, OWN_ARRAYS)
     with read_errors(path, "an .npz file of plain arrays"):
+        X = arrays["X"]
         if "scale" in arrays:
-            arrays["X"] = arrays["X"].astype(np.float32) * arrays["scale"].astype(np.float32)
-        return _from_arrays(arrays, path.stem)
-
-
-def _from_arrays(arrays: Stated, name: str) -> Dataset:
-    """Return the data set of arrays that are named like the fields of a `Dataset`.
-
-    X and y must be there; rate_hz, unit, channels, limit, fit, cause and part are used if they are
-    there, and any other array is ignored. `name` becomes the name of the data set. Raises DataError
-    if `make_dataset` refuses the arrays, and TypeError or ValueError if `rate_hz` is no number.
-    """
-    units, channels = (
-        tuple(map(str, np.atleast_1d(arrays.get(key, ())).tolist())) for key in ("unit", "channels")
-    )
-    rate_hz = arrays.get("rate_hz")
-    return make_dataset(
-        arrays["X"],
-        arrays["y"],
-        name=name,
-        rate_hz=rate_hz and float(rate_hz),
-        unit=unit_text(units),
-        channels=channels,
-        limit=arrays.get("limit"),
-        fit=arrays.get("fit", "strict"),
-        cause=arrays.get("cause"),
-        part=arrays.get("part"),
-    )
+            X = X.astype(np.float32) * arrays["scale"].astype(np.float32)
+        units, channels = (
+            [*map(str, np.atleast_1d(arrays.get(key, ())).tolist())] for key in ("unit", "channels")
+        )
+        return make_dataset(
+            X,
+            arrays["y"],
+            name=path.stem,
+            rate_hz=float(arrays["rate_hz"]) if "rate_hz" in arrays else None,
+            unit=unit_text(units),
+            channels=channels,
+            cause=arrays.get("cause"),
+            part=arrays.get("part"),
+        )
 
 
 def _read_store(path: Path) -> Dataset:

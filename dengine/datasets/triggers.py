@@ -143,8 +143,11 @@ class Start(NamedTuple):
     seen: bool
 
 
+@dataclass(slots=True)
 class StartFinder:
     """Finds where a trigger starts, sample by sample.
+
+    A trigger that is on at the first sample is no start.
 
     Parameters
     ----------
@@ -154,15 +157,10 @@ class StartFinder:
         Seconds that the trigger must have been off before a start.
     """
 
-    def __init__(self, step: float, quiet_s: float = 0.0) -> None:
-        self.step = step
-        self.quiet_s = quiet_s
-        self.forget()
-
-    def forget(self) -> None:
-        """Forget all samples. A trigger that is on at the next one is no start."""
-        self._off_since: float | None = None
-        self._last_off = 0.0
+    step: float
+    quiet_s: float = 0.0
+    _off_since: float | None = None
+    _last_off: float = 0.0
 
     def feed(self, time: float, active: bool) -> Start | None:
         """Take the next sample; return where an insertion begins if the sample shows it, else None.

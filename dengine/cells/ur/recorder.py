@@ -259,7 +259,7 @@ class RtdeRecorder(AbstractContextManager["RtdeRecorder"]):
 
         The number of connections that `arm` noted is discarded, too.
         """
-        self._finder.forget()
+        self._finder = StartFinder(self._step, self.trigger.quiet_s)
         self._rows = []
         self._start = None
         self._armed = None

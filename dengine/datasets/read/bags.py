@@ -24,11 +24,9 @@ from .split import signals_of, verdicts_of
 
 SUFFIX = ".mcap"
 STAMP, LOG_TIME = "stamp", "log_time"
-Message = tuple[str, int, Any]  # topic, nanoseconds of the log, message
-Events = dict[str, list[tuple[int, Any]]]  # by topic: nanoseconds of the log, data
 
 
-def read_messages(path: Path, topics: Collection[str] | None) -> Iterator[Message]:
+def read_messages(path: Path, topics: Collection[str] | None) -> Iterator[tuple[str, int, Any]]:
     """Yield (topic, time in ns, message) for each message of some topics, in the file's order.
 
     The time is that of the bag's log. `topics` None means all topics. Raises DataError if the file
@@ -101,7 +99,10 @@ def read_bag(
         raise DataError(f"Expected channels of one topic, got {listed(sorted(topics))}.")
     verdicts = verdicts_of(description)
     others = verdicts.union(description.part.column, signals_of(description), [description.order])
-    events: Events = {name: [] for name in others if name.startswith("/") and "." not in name}
+    # by topic: nanoseconds of the log, data
+    events: dict[str, list[tuple[int, Any]]] = {
+        name: [] for name in others if name.startswith("/") and "." not in name
+    }
     fields = [attrgetter(column.partition(".")[2]) for column in columns]
     rows: list[Any] = []
     for name in names:

@@ -17,10 +17,9 @@ from ..table import UnreadableError
 GZIP = ".gz"
 DATE = re.compile(r"(?<![0-9])([0-9]{2})\.([0-9]{2})\.([0-9]{4})(?![0-9])")
 BAD = (ValueError, NotImplementedError, OSError, IndexError)  # what an unusable pattern raises
-Key = list[tuple[int, int, str]]
 
 
-def natural_key(text: str) -> Key:
+def natural_key(text: str) -> list[tuple[int, int, str]]:
     """Return a key that sorts runs of digits in texts by their size: run_2 before run_10.
 
     Decimals and signs do not count: 0.5 is before 0.25. Dates like 31.12.2025 are sorted by year,
@@ -70,8 +69,9 @@ def find_files(root: Path, description: Description) -> list[str]:
     """
     if root.is_file():
         return [root.name]
-    listings = {source.listing for source in (*description.labels, description.windows)}
-    names = match_files(root, description.files) - listings - {FOLDER_FILE}
+    aside = {FOLDER_FILE, description.windows.listing}
+    aside |= {source.listing for source in description.labels}
+    names = match_files(root, description.files) - aside
     for pattern in description.exclude:
         names -= {*fnmatch.filter(names, pattern)}
     if not names:
@@ -108,5 +108,6 @@ def caught(faults: list[Fault], source: str) -> Iterator[None]:
     try:
         yield
     except DataError as error:
-        line, column = getattr(error, "line", 0), getattr(error, "column", "")
-        faults.append(Fault(source, line, str(error).rstrip("."), column))
+        message = str(error).rstrip(".")
+        line = getattr(error, "line", 0)
+        faults.append(Fault(source, line, message, getattr(error, "column", "")))

@@ -20,7 +20,6 @@ from ..description import TextForm, flat
 from ..table import Cells, Table, UnreadableError
 from .text import to_utf8
 
-DAMAGES = (LookupError, TypeError, ValueError)  # of lists of several forms
 ITEMS = (list, np.ndarray)
 Columns = dict[str, Cells]
 
@@ -70,7 +69,8 @@ def columns_of(prefix: str, value: Any) -> Columns:
     """
     if isinstance(value, np.ndarray) and value.dtype == object:
         value = value.tolist()
-    with instead(UnreadableError, f"Expected items of one form in {prefix}", *DAMAGES):
+    message = f"Expected items of one form in {prefix}"
+    with instead(UnreadableError, message, LookupError, TypeError, ValueError):
         nested = _turned(value)
     if nested is None:
         return {prefix: as_cells(value if isinstance(value, ITEMS) else [value])}

@@ -15,7 +15,7 @@ import torch
 from ...errors import DataError, instead, listed
 from ...records import FITS, Floats, TraceArray
 from ...traces import can_fit_length, fit_length
-from ..checks import check_description, lost_note, without_repeats
+from ..checks import check_description, without_repeats
 from ..dataset import Dataset, Fault, make_dataset, unit_text
 from ..description import ANY, ORDERS, Channel, Description, RowWords, TextForm
 from ..table import Cells, Recording, Table, UnreadableError
@@ -178,8 +178,8 @@ def read_recordings(
         the files. A recording that does not follow the description or repeats another is one of its
         `faults`, and so is a file that cannot be read; of recordings with equal samples and
         different labels none is kept. One whose part was not checked counts in `unlabelled`.
-        `notes` says if samples are lost, rows of a listing name no recording, or there are fewer
-        recordings than when the description was made.
+        `notes` says if rows of a listing name no recording, or there are fewer recordings than when
+        the description was made.
 
     Raises
     ------
@@ -219,7 +219,6 @@ def read_recordings(
     notes = [label.unused_note() for label in labels]
     if n_found < n_seen:
         notes.append(f"The description was made for {n_seen} recordings, now there are {n_found}.")
-    notes.append(lost_note(recordings))
     return replace(
         dataset_of(recordings, description),
         name=name,
