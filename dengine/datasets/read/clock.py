@@ -46,13 +46,18 @@ def scale_of(unit: str) -> float:
 def times_of(table: Table, clock: Clock, form: TextForm) -> Times:
     """Return the time of each row in seconds since the first row, and the time of the first row.
 
+    If times of day fall from one row to the next by more than half a day, midnight has passed,
+    unless a column of the clock has the date. If a counter falls by more than half of `clock.wrap`,
+    it began again at 0; with a `wrap` of 0 times may fall.
+
     Parameters
     ----------
     table : Table
         The rows of a recording.
     clock : Clock
         The section `[time]`, which has passed `check_clock`. The times in its columns are added up;
-        a column of one cell holds for all rows. Without columns there is one time, 0.
+        a column of one cell holds for all rows, and a column of datetimes needs no format. Without
+        columns there is one time, 0.
     form : TextForm
         The section `[text]`: how numbers are written.
 
@@ -66,52 +71,37 @@ def times_of(table: Table, clock: Clock, form: TextForm) -> Times:
     Raises
     ------
     UnreadableError
-        If a column is missing, empty or of another length, or a cell is no time of the stated form,
-        or no single time because clocks are changed.
+        If a column is missing, empty or of another length, or a cell is no time of the stated form
+        (a missing number, too), or no single time because clocks are changed.
     DataError
         If a format is no unit of time.
     """
     seconds: Floats = np.zeros(1)
     start = 0.0
     for name, unit in zip(clock.column, clock.format, strict=True):
-        relative, first = column_times(table, name, unit, clock, form)
-        if len({1, len(seconds), len(relative)}) > 2:
-            raise UnreadableError(
-                f"Expected {len(seconds)} times, got {len(relative)}", column=name
-            )
-        seconds = seconds + relative
+        cells = table.column(name)
+        if not len(cells):
+            raise UnreadableError("Expected times, got none", column=name)
+        is_date = cells.dtype.kind == "M"
+        if is_date or is_dated(unit):
+            values, first = _dates(table, name, unit, clock)
+            period = 0.0 if is_date or any(map(has_day, clock.format)) else DAY
+        else:
+            scale = scale_of(unit)
+            times: Cells = table.numbers(name, form)
+            table.refuse(np.isnan(times), "a time", name)
+            with suppress(ValueError, OverflowError):
+                whole = cells.astype(np.int64)  # too long for a float, as nanoseconds are
+                times = whole if (whole == times).all() else times
+            values = (times - times[0]) * scale
+            first = float(times[0]) * scale
+            period = clock.wrap * scale
+        if len({1, len(seconds), len(values)}) > 2:
+            raise UnreadableError(f"Expected {len(seconds)} times, got {len(values)}", column=name)
+        begins_again = np.diff(values, prepend=0.0) < -period / 2
+        seconds = seconds + (values + np.cumsum(begins_again) * period)
         start += first
     return seconds, start
-
-
-def column_times(table: Table, name: str, unit: str, clock: Clock, form: TextForm) -> Times:
-    """Return the times of one column in seconds since its first row, and the time of that row.
-
-    `unit` is the unit of its cells, or the form of its dates or times of day; a column of datetimes
-    needs neither. If times of day fall from one row to the next by more than half a day, midnight
-    has passed, unless a column of the clock has the date. If a counter falls by more than half of
-    `clock.wrap`, it began again at 0; with a `wrap` of 0 times may fall. `form` says how numbers
-    are written. Raises UnreadableError if the column `name` is missing or empty, or a cell is no
-    such time (a missing number, too), and DataError if `unit` is no unit of time.
-    """
-    cells = table.column(name)
-    if not len(cells):
-        raise UnreadableError("Expected times, got none", column=name)
-    is_date = cells.dtype.kind == "M"
-    if is_date or is_dated(unit):
-        values, first = _dates(table, name, unit, clock)
-        period = 0.0 if is_date or any(map(has_day, clock.format)) else DAY
-    else:
-        scale = scale_of(unit)
-        times: Cells = table.numbers(name, form)
-        table.refuse(np.isnan(times), "a time", name)
-        with suppress(ValueError, OverflowError):
-            whole = cells.astype(np.int64)  # too long for a float, as nanoseconds since 1970 are
-            times = whole if (whole == times).all() else times
-        values = (times - times[0]) * scale
-        first = float(times[0]) * scale
-        period = clock.wrap * scale
-    return values + np.cumsum(np.diff(values, prepend=0.0) < -period / 2) * period, first
 
 
 def _dates(table: Table, name: str, unit: str, clock: Clock) -> Times:

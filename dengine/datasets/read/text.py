@@ -57,8 +57,10 @@ def read_text(content: bytes, source: str, form: TextForm, kind_of: Kind = lambd
         If Python does not know the encoding.
     """
     content = to_utf8(content, form.encoding)
-    header = _header_line(content, form.header)
-    above = header if isinstance(form.header, str) else 0
+    header = form.header
+    above = 0
+    if isinstance(header, str):
+        header = above = _header_line(content, header)
     first = form.data + above
     units = form.units and form.units + above
     end = content.rstrip(b"\n").count(b"\n") + 2
@@ -118,16 +120,11 @@ def header_names(cells: Sequence[str]) -> list[str]:
     return [f"{name}.{n}" if n > 1 else name for name, n in zip(names, places, strict=True)]
 
 
-def _header_line(content: bytes, header: int | str) -> int:
-    """Return the number of the header's line, from 1; 0 for none.
+def _header_line(content: bytes, header: str) -> int:
+    """Return the number of the first line, from 1, that begins with a text, `header`.
 
-    The first line that begins with the text counts; a number is returned as it is. Raises
-    UnreadableError if `header` is a text and no line begins with it.
-
-    content : the file in UTF-8. header : the number, or the text with which the line begins.
+    `content` is the file in UTF-8. Raises UnreadableError if no line begins with the text.
     """
-    if isinstance(header, int):
-        return header
     for i, line in enumerate(io.BytesIO(content), 1):
         if line.startswith(header.encode(errors="replace")):
             return i
