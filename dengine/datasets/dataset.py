@@ -18,7 +18,8 @@ from ..traces import as_traces
 if TYPE_CHECKING:
     import pandas as pd
 
-LEAST_RATE_HZ, MOST_RATE_HZ = 1.0, 1e6  # of anything that a cell samples
+LEAST_RATE_HZ = 1.0  # of anything that a cell samples
+MOST_RATE_HZ = 1e6
 Texts = NDArray[np.str_]
 Names = tuple[str, ...]
 Progress = Callable[[int], None]  # called with the number of files or traces that are done

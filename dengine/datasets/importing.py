@@ -253,14 +253,15 @@ def import_parts(
         new: dict[str, StoredDecision] = {}
         labels: dict[str, NewLabel] = {}
         for decision, trace, label in chunk:
-            earlier = new.get(decision.id) or store.decisions.get(decision.id)
-            reported = labels.get(decision.id) or earlier
+            id_ = decision.id
+            earlier = new.get(id_) or store.decisions.get(id_)
+            reported = labels.get(id_) or earlier
             if reported is not None and reported.source is not None:  # a forgotten one has a label
                 outcome = "repeated" if label == reported.success else "contradicted"
                 counts[outcome] += label is not None
                 continue
             stored = earlier or new.setdefault(
-                decision.id, _as_stored(decision, trace, gate, policy, store.clock())
+                id_, _as_stored(decision, trace, gate, policy, store.clock())
             )
             if counts_unreported and decision.action is Action.ACCEPT:
                 # A decision that was stored without a label was counted as unreported.
@@ -269,8 +270,8 @@ def import_parts(
                 n_since = n_unreported * (not stored.quarantined)
                 n_unreported -= n_since
                 source = source_of(decision.action, decision.audit, label)
-                labels[decision.id] = NewLabel(
-                    decision.id,
+                labels[id_] = NewLabel(
+                    id_,
                     label,
                     source,
                     0,

@@ -184,8 +184,8 @@ def own_reader(source: Any) -> Callable[[], Dataset] | None:
         return lambda: make_dataset(*source)
     if hasattr(source, "columns"):
         return partial(_from_own_frame, source) if OWN in source.attrs else None
-    if str(source) in BUNDLED:
-        source = Path(str(files("dengine"))) / "data" / BUNDLED[str(source)]
+    if name := BUNDLED.get(str(source)):
+        source = Path(str(files("dengine"))) / "data" / name
     path = as_source(source)
     if path.is_file() and not saved_description(path).is_file():
         for is_own, read in OWN_FILES:
@@ -304,7 +304,7 @@ def _read_store(path: Path) -> Dataset:
         labelled.traces,
         labelled.labels,
         # As the store counts: a part that came again has one vote.
-        part=hashes if len({*hashes.tolist()}) < len(hashes) else None,
+        part=hashes if len(np.unique(hashes)) < len(hashes) else None,
         name=path.stem,
         rate_hz=spec.rate_hz,
         unit=unit_text(spec.units),

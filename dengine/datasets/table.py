@@ -212,7 +212,8 @@ def pattern_of(decimal: str, thousands: str) -> re.Pattern[str]:
     `decimal` is its decimal mark, and `thousands` the mark that may stand between groups of three
     digits; "" allows no groups.
     """
-    mark, point = re.escape(thousands), re.escape(decimal)
+    mark = re.escape(thousands)
+    point = re.escape(decimal)
     groups = rf"[1-9]\d{{0,2}}(?:{mark}\d{{3}})+|" if mark else ""
     digits = rf"(?:(?:{groups}\d+)(?:{point}\d*)?|{point}\d+)"
     return re.compile(rf"[-+{MINUS}]?{digits}(?:[eE][-+]?\d+)?", re.ASCII)

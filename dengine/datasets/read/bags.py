@@ -23,7 +23,8 @@ from .frames import as_cells
 from .split import signals_of, verdicts_of
 
 SUFFIX = ".mcap"
-STAMP, LOG_TIME = "stamp", "log_time"
+STAMP = "stamp"
+LOG_TIME = "log_time"
 
 
 def read_messages(path: Path, topics: Collection[str] | None) -> Iterator[tuple[str, int, Any]]:

@@ -9,7 +9,7 @@ import io
 import json
 import re
 from collections.abc import Mapping
-from itertools import chain, zip_longest
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -22,6 +22,7 @@ from .text import to_utf8
 
 ITEMS = (list, np.ndarray)
 Columns = dict[str, Cells]
+Rows = list[tuple[int, Mapping[str, Any]]]  # the line of each, and its cells by column
 
 
 def read_objects(content: bytes, source: str, form: TextForm, has_lines: bool) -> Table:
@@ -35,8 +36,7 @@ def read_objects(content: bytes, source: str, form: TextForm, has_lines: bool) -
     know.
     """
     text = to_utf8(content, form.encoding).decode()
-    rows: list[Mapping[str, Any]] = []
-    numbers: list[int] = []
+    rows: Rows = []
     for number, line in enumerate(text.split("\n"), 1) if has_lines else [(0, text)]:
         try:
             value = json.loads(line.strip() or "[]")
@@ -46,13 +46,21 @@ def read_objects(content: bytes, source: str, form: TextForm, has_lines: bool) -
         for item in value if isinstance(value, list) else [value]:
             if not isinstance(item, Mapping):
                 raise UnreadableError(f"Expected an object of JSON, got {shortened(item)}", number)
-            rows.append(flat("", item))
-            numbers.append(number)
+            rows.append((number, flat("", item)))
+    return _table_of(source, rows, "objects of JSON")
+
+
+def _table_of(source: str, rows: Rows, wanted: str) -> Table:
+    """Return a table of rows; raise UnreadableError, which says what was `wanted`, without rows.
+
+    A cell is None if its row lacks the column. `source` is the name of the file.
+    """
     if not rows:
-        raise UnreadableError("Expected objects of JSON, got none")
-    names = dict.fromkeys(chain(*rows))
-    columns = {name: as_cells([row.get(name) for row in rows]) for name in names}
-    return Table(source, columns, np.array(numbers))
+        raise UnreadableError(f"Expected {wanted}, got none")
+    lines, cells = zip(*rows, strict=True)
+    names = dict.fromkeys(chain(*cells))
+    columns = {name: as_cells([row.get(name) for row in cells]) for name in names}
+    return Table(source, columns, np.array(lines))
 
 
 def columns_of(prefix: str, value: Any) -> Columns:
@@ -159,10 +167,10 @@ def read_ts(content: bytes, source: str, form: TextForm) -> Table:
     """Return the table of a `.ts` file of the UCR archive, with a row for each series.
 
     Channels are the columns `0`, `1`, ..., whose cells are lists of texts; the class is the column
-    `class`. A series with fewer channels than others has a list of one empty text for each that is
-    missing. `content` has the bytes of the file, `source` is its name in errors, and of `form` the
-    encoding is used. Raises UnreadableError if the file is not in this encoding, or has no series
-    below a line `@data`, and LookupError for an encoding that Python does not know.
+    `class`. A series with fewer channels than others has None for each that is missing. `content`
+    has the bytes of the file, `source` is its name in errors, and of `form` the encoding is used.
+    Raises UnreadableError if the file is not in this encoding, or has no series below a line
+    `@data`, and LookupError for an encoding that Python does not know.
 
     References
     ----------
@@ -170,14 +178,10 @@ def read_ts(content: bytes, source: str, form: TextForm) -> Table:
     """
     text = to_utf8(content, form.encoding).decode()
     head, *below = re.split(r"(?im)^[ \t]*@data[ \t]*$", text, maxsplit=1)
-    lines = enumerate("".join(below).split("\n"), head.count("\n") + 1)
-    rows = {i: line.strip().rpartition(":") for i, line in lines if line.strip()}
-    if not rows:
-        raise UnreadableError("Expected series below a line @data, got none")
-    series = (channels.split(":") for channels, _, _ in rows.values())
-    columns = {
-        str(c): as_cells([cell.split(",") for cell in cells])
-        for c, cells in enumerate(zip_longest(*series, fillvalue=""))
-    }
-    columns["class"] = as_cells([label for _, _, label in rows.values()])
-    return Table(source, columns, [*rows])
+    rows: Rows = []
+    for number, line in enumerate("".join(below).split("\n"), head.count("\n") + 1):
+        if line.strip():
+            *series, label = line.strip().split(":")
+            channels = {str(c): cells.split(",") for c, cells in enumerate(series)}
+            rows.append((number, {**channels, "class": label}))
+    return _table_of(source, rows, "series below a line @data")

@@ -27,7 +27,8 @@ def table_of(content: bytes, name: str, description: Description) -> Table:
     the file does not have this format, and DataError without pyarrow for a Parquet file; for a text
     file also SettingError if `windows.trigger` is malformed.
     """
-    kind, form = description.format, description.text
+    kind = description.format
+    form = description.text
     if kind == "ts":
         return frames.read_ts(content, name, form)
     if kind in OBJECTS:
@@ -47,12 +48,13 @@ def column_kind(description: Description) -> Kind:
     description does not name so is not needed. Raises SettingError if `windows.trigger` is
     malformed.
     """
-    clock = zip(description.time.column, description.time.format, strict=False)
-    dated = {name for name, form in clock if is_dated(form)}
+    clock = description.time
+    forms = zip(clock.column, clock.format, strict=False)
+    dated = {name for name, form in forms if is_dated(form)}
     order = {description.order} - ORDERS
     words = dated.union(description.part.column, description.rows, order)
     words |= {source.column for source in description.labels}
-    numbers = {*description.time.column, *signals_of(description)}
+    numbers = {*clock.column, *signals_of(description)}
     patterns = [*map(pattern_of, description.channels)]
 
     def kind_of(name: str) -> str:
@@ -99,11 +101,12 @@ def split(table: Table, description: Description) -> Iterator[Table]:
     `part.column` of the layout `long` is not stated or not in the table.
     """
     table = replace(table, path=table.source)
-    if description.layout == "long":
+    layout = description.layout
+    if layout == "long":
         yield from _split_rows(table, description)
-    elif description.layout == "columns":
+    elif layout == "columns":
         yield from _split_columns(table, description)
-    elif description.layout in ("wide", "npz") or description.format in OBJECTS:
+    elif layout in ("wide", "npz") or description.format in OBJECTS:
         yield from _split_wide(table, description)
     else:
         yield table
@@ -146,17 +149,18 @@ def _split_wide(table: Table, description: Description) -> Iterator[Table]:
     empty one in none. A part has damage if its row had a wrong number of cells, or if the items of
     a list in it are not all alike; then it has only its numbered channels.
     """
-    groups = {
-        key: [match[0] for match in match_numbered(key, table.columns)]
-        for key in description.channels
-        if ANY in key
-    }
-    groups = {key: names for key, names in groups.items() if names}
-    curves = {key: np.stack([*map(table.column, names)], axis=1) for key, names in groups.items()}
-    units = {key: table.units.get(names[0], "") for key, names in groups.items()}
+    groups: dict[str, list[str]] = {}
+    curves: frames.Columns = {}
+    units = {**table.units}
+    for key in description.channels:
+        names = [match[0] for match in match_numbered(key, table.columns)]
+        if ANY in key and names:
+            groups[key] = names
+            curves[key] = np.stack([*map(table.column, names)], axis=1)
+            units[key] = units.get(names[0], "")
     used = {*chain(*groups.values())}
     others = {name: c for name, c in table.columns.items() if len(c) and name not in used}
-    rest = replace(table, columns=others, units={**table.units, **units}, origin=groups)
+    rest = replace(table, columns=others, units=units, origin=groups)
     for i in range(len(table.lines)):
         part = _row_of(rest, i)
         samples = {key: without_empty_end(rows[i]) for key, rows in curves.items()}

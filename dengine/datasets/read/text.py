@@ -21,7 +21,8 @@ from ..table import Table, UnreadableError
 COMMENT = re.compile(r"^[#%]+\s*")
 BLANK = " "
 REST = "*"  # at the end of the last name: it stands for all columns that remain
-NUMBER, WORD = "number", "word"  # kinds of columns
+NUMBER = "number"  # kinds of columns
+WORD = "word"
 Kind = Callable[[str], str]
 
 
