@@ -195,8 +195,12 @@ class Dataset:
         """
         most = self.X.shape[-1]
         least = most if self.fit == "resample" else 1
-        wanted = f"{least} to {most} samples of {self.name}"
-        expect_data(least <= samples <= most, wanted, samples, "resampled traces stay whole")
+        expect_data(
+            least <= samples <= most,
+            f"{least} to {most} samples of {self.name}",
+            samples,
+            "resampled traces stay whole",
+        )
         fit = "cut" if samples < most and self.fit == "pad" else self.fit
         return replace(self, X=np.ascontiguousarray(self.X[..., :samples]), fit=fit)
 

@@ -313,8 +313,7 @@ class Description:
         """
         version = values.get("version", VERSION)
         is_older = isinstance(version, int) and version <= VERSION
-        wanted = f"version {VERSION} of {where}"
-        expect_data(is_older, wanted, version, "install a newer dengine")
+        expect_data(is_older, f"version {VERSION} of {where}", version, "install a newer dengine")
         return _made(cls, values, where)  # type: ignore[no-any-return]
 
     @classmethod

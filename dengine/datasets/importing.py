@@ -81,10 +81,14 @@ def check_agreement(data: Dataset, trace_spec: TraceSpec) -> None:
     """
     spec = data.spec
     is_resampled = {item.fit == "resample" for item in (spec, trace_spec)}
-    wanted = f"recordings brought to {trace_spec.samples} samples by {trace_spec.fit}"
-    do = "state these in [traces], or what is known would count again"
     is_same = len(is_resampled) == 1 and spec.samples == trace_spec.samples
-    expect(data.lengths is None or is_same, wanted, (spec.samples, spec.fit), do, TraceError)
+    expect(
+        data.lengths is None or is_same,
+        f"recordings brought to {trace_spec.samples} samples by {trace_spec.fit}",
+        (spec.samples, spec.fit),
+        "state these in [traces], or what is known would count again",
+        TraceError,
+    )
     rates = (trace_spec.rate_hz, spec.rate_hz)
     is_rate = None in rates or math.isclose(*rates, rel_tol=RATE_TOLERANCE)  # type: ignore[arg-type]
     expect(is_rate, f"traces at {rates[0]} Hz", rates[1], "resample them", TraceError)
@@ -299,10 +303,11 @@ def _as_stored(
     decision, seconds since 1970.
     """
     fault, content = gate(torch.from_numpy(trace))
-    is_certain = decision.predicted is not Action.VERIFY
-    propensity = policy.audited_share if is_certain else 1.0
-    reason = REASONS[fault] if fault else decision.reason
-    made = replace(decision, reason=reason, propensity=propensity)
+    made = replace(
+        decision,
+        reason=REASONS[fault] if fault else decision.reason,
+        propensity=1.0 if decision.predicted is Action.VERIFY else policy.audited_share,
+    )
     return StoredDecision(made, trace.copy(), trace_hash(content, made.part), bool(fault), time)
 
 

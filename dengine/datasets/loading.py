@@ -132,8 +132,11 @@ def description_of(
         return Description.from_dict(description)
     if description is None:
         source = as_source(source)
-        wanted = "a description of the table, like the one that describe(table) proposes"
-        expect_data(isinstance(source, Path), wanted, None)
+        expect_data(
+            isinstance(source, Path),
+            "a description of the table, like the one that describe(table) proposes",
+            None,
+        )
         description = saved_description(source)
         if not description.is_file():
             proposal = describe(source, stated)
@@ -291,14 +294,20 @@ def _read_store(path: Path) -> Dataset:
 
     with opening(path, must_exist=True) as store:
         difference = store.database.check_integrity(0, since=0)
-        do = "see `dengine verify`, and restore a copy"
-        expect_data(not difference, f"{path} as its ledger has it", difference, do)
+        expect_data(
+            not difference,
+            f"{path} as its ledger has it",
+            difference,
+            "see `dengine verify`, and restore a copy",
+        )
         labelled = store.labels.with_traces()
         spec = stored_trace_spec(store.settings.read())
     store.close()
     if spec is None or not len(labelled.labels):
-        do = "record some first, as in shadow mode"
-        raise DataError(f"Expected a store with labelled traces, {path} has none; {do}.")
+        raise DataError(
+            f"Expected a store with labelled traces, {path} has none; record some first, as in "
+            "shadow mode."
+        )
     hashes = labelled.hashes
     return make_dataset(
         labelled.traces,

@@ -80,8 +80,9 @@ class Table:
         Raises UnreadableError if there is no column of this name.
         """
         if name not in self.columns:
-            columns = listed(self.columns) or "none"
-            raise UnreadableError(f"Expected a column {name}, got {columns}", self.header, name)
+            raise UnreadableError(
+                f"Expected a column {name}, got {listed(self.columns) or 'none'}", self.header, name
+            )
         return self.columns[name]
 
     def whole(self) -> "Table":

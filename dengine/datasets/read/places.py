@@ -167,10 +167,9 @@ class LabelReader:
         names = filter(None, (part, path, name, without_suffix(path), without_suffix(name)))
         keys = [key for key in map(as_key, names) if key in self.listing]
         if not keys:
-            others = f"it has {listed(sorted(self.listing)[:2])}"
             raise UnreadableError(
-                f"Expected {part or name} in {source.listing}, it is not listed; {others}; if its "
-                "name contains the key, state part.path"
+                f"Expected {part or name} in {source.listing}, it is not listed; it has "
+                f"{listed(sorted(self.listing)[:2])}; if its name contains the key, state part.path"
             )
         self.used.add(keys[0])
         return self.listing[keys[0]]
@@ -205,8 +204,12 @@ class LabelReader:
         It names up to eight of them, with the number of all.
         """
         unused = sorted(self.listing.keys() - self.used, key=natural_key)
-        n = f"{len(unused)} of {len(self.listing)} rows of {self.source.listing}"
-        return f"{n} name no recording that was read: {listed(unused)}." if unused else ""
+        if not unused:
+            return ""
+        return (
+            f"{len(unused)} of {len(self.listing)} rows of {self.source.listing} name no recording "
+            f"that was read: {listed(unused)}."
+        )
 
 
 def as_key(word: str) -> str:

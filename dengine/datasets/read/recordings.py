@@ -131,9 +131,11 @@ def samples_of(table: Table, column: str, channel: Channel, form: TextForm) -> F
     unit = table.units.get(column)
     factor = conversion(unit or unit_in(column.rstrip(ANY)), channel.unit)
     if factor is None and unit:
-        wanted = f"the unit {channel.unit}, or one that converts to it"
-        line = form.units + table.header * isinstance(form.header, str)
-        raise UnreadableError(f"Expected {wanted}, got {bare(unit)}", line, column)
+        raise UnreadableError(
+            f"Expected the unit {channel.unit}, or one that converts to it, got {bare(unit)}",
+            form.units + table.header * isinstance(form.header, str),
+            column,
+        )
     # A name may have another quantity, as `U [V]` of a force.
     return values * ((factor or 1.0) * channel.factor)
 
