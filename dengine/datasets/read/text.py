@@ -192,12 +192,13 @@ def _read_plain(content: bytes, table: Table, form: TextForm, kind_of: Kind) -> 
         return None
     columns = {**table.columns}
     for name, kind in kinds.items():
-        if kind:
-            columns[name] = frame[name].to_numpy(object if kind == WORD else None)
-        if kind == NUMBER and not (
-            columns[name].dtype.kind in "iuf" and np.isfinite(columns[name]).all()
-        ):
-            return None
+        cells = frame[name]
+        if kind == WORD:  # equal words are one object
+            columns[name] = np.array(cells.array.categories, dtype=object)[cells.array.codes]
+        elif kind == NUMBER:
+            columns[name] = cells.to_numpy()
+            if cells.dtype.kind not in "iuf" or not np.isfinite(columns[name]).all():
+                return None
     return replace(table, columns=columns)
 
 
