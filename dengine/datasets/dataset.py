@@ -68,7 +68,7 @@ class Fault:
         return f"{self.source}{line}{column}: {self.message}"
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, repr=False)
 class Dataset:
     """Labelled traces, in the order of their recording.
 
@@ -127,6 +127,14 @@ class Dataset:
 
     def __len__(self) -> int:
         return len(self.y)
+
+    def __repr__(self) -> str:
+        shape = " x ".join(map(str, self.X.shape[1:]))
+        good = int(self.y.sum())
+        return (
+            f"<Dataset {self.name}: {len(self)} traces, {shape} samples, {good} good, "
+            f"{len(self.faults)} left out>"
+        )
 
     @property
     def cube(self) -> TraceArray:

@@ -16,6 +16,7 @@ from .frames import as_cells
 from .places import in_listing, listing_table
 from .split import verdicts_of
 
+EPOCH = 1e8  # seconds: smaller times of a listing count from the start of the recording
 TOLERANCE = 1e-5  # seconds: float64 rounds dates to less
 Windows = Iterator[tuple[str, slice, str]]  # the key of a part, its rows, and what is wrong
 
@@ -86,11 +87,12 @@ def _listed(table: Table, times: Floats, description: Description, base: Path) -
     """Yield the key, the rows and the fault ("" for none) of each window, by increasing start.
 
     The listing, a file in the folder `base`, has the key (the part's number), start and end of each
-    window. `times`, shape (rows,), are the recording's, in seconds. The rows are those from the
-    start to before the end (less 1e-5 s, for rounding). A window has a fault if it overlaps an
-    earlier one, has no samples, or goes beyond the recording by more than 1.5 steps of the stated
-    rate (without one: at all); one without samples gets the first row. Raises DataError if the
-    listing or its times cannot be read.
+    window. `times`, shape (rows,), are the recording's, in seconds. If they begin at 1e8 s or
+    later, like dates, and all ends in the listing are smaller, its times count from the first of
+    `times`. The rows are those from the start to before the end (less 1e-5 s, for rounding). A
+    window has a fault if it overlaps an earlier one, has no samples, or goes beyond the recording
+    by more than 1.5 steps of the stated rate (without one: at all); one without samples gets the
+    first row. Raises DataError if the listing or its times cannot be read.
     """
     about = description.windows
     form = description.text
@@ -102,9 +104,11 @@ def _listed(table: Table, times: Floats, description: Description, base: Path) -
             clock = Clock((column,), (about.format,), description.time.zone)
             seconds, start = times_of(listing, clock, form)
             bounds.append(seconds + (start - TOLERANCE))
+    zero = times[0] if bounds[1].max() < EPOCH <= times[0] else 0.0
+    begins, ends = np.array(bounds) + zero
     margin = 1.5 / (description.time.rate_hz or np.inf) + TOLERANCE
     latest = -np.inf
-    for begin, end, key in sorted(zip(*bounds, keys.tolist(), strict=True)):
+    for begin, end, key in sorted(zip(begins, ends, keys.tolist(), strict=True)):
         rows = np.flatnonzero((times >= begin) & (times < end))
         fault = ""
         if begin < latest - TOLERANCE:
