@@ -95,32 +95,22 @@ def without_repeats(recordings: Sequence[Recording]) -> tuple[list[Recording], l
     """
     traces = [recording.trace for recording in recordings]
     hashes = content_hash(np.stack(traces)).tolist() if traces else []
-    groups = defaultdict[int, list[Recording]](list)
-    for hash_, recording in zip(hashes, recordings, strict=True):
-        samples = recording.trace[np.isfinite(recording.trace)]
-        if not (samples == samples[:1]).all():
-            groups[hash_].append(recording)
-    faults = dict[int, Fault]()  # by the recording: two may have one source
-    for first, *others in groups.values():
+    groups = defaultdict[tuple[int, int], list[Recording]](list)
+    for i, trace in enumerate(traces):
+        samples = trace[np.isfinite(trace)]
+        is_dead = (samples == samples[:1]).all()
+        groups[hashes[i], i if is_dead else -1].append(recordings[i])
+    kept: list[Recording] = []
+    faults: list[Fault] = []
+    for first, *repeats in groups.values():
         message = f"Expected other samples than those of {first.source}, it repeats them"
-        repeats = others
-        if any(other.label != first.label for other in others):
+        if all(item.label == first.label for item in repeats):
+            kept.append(first)
+        else:
             message = f"Expected one label for the samples of {first.source}, got two"
-            repeats = [first, *others]
-        faults |= {id(item): Fault(item.source, 0, message) for item in repeats}
-    kept = [recording for recording in recordings if id(recording) not in faults]
-    return kept, [*faults.values()]
-
-
-def lost_note(recordings: Sequence[Recording]) -> str:
-    """Return a sentence on lost samples, which are NaN or infinite; "" if no recording has any.
-
-    It says how many samples are lost, in how many recordings, and names up to eight of these.
-    """
-    n_lost = {item.source: int((~np.isfinite(item.trace)).sum()) for item in recordings}
-    lost = [source for source, n in n_lost.items() if n]
-    where = f"in {len(lost)} of {len(recordings)} recordings: {listed(lost)}"
-    return f"{sum(n_lost.values())} samples are lost, {where}." if lost else ""
+            repeats = [first, *repeats]
+        faults += [Fault(item.source, 0, message) for item in repeats]
+    return kept, faults
 
 
 def tolerance_note(data: Dataset, lower_bound: float) -> str:

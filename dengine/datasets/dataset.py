@@ -12,13 +12,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import DataError, TraceError, expect, instead, listed
-from ..records import Ints, TraceSpec
+from ..records import Ints, TraceArray, TraceSpec
 from ..traces import as_traces
 
 if TYPE_CHECKING:
     import pandas as pd
 
-LEAST_RATE_HZ, MOST_RATE_HZ = 1.0, 1e6  # of anything that a cell samples
+LEAST_RATE_HZ = 1.0  # of anything that a cell samples
+MOST_RATE_HZ = 1e6
 Texts = NDArray[np.str_]
 Names = tuple[str, ...]
 Progress = Callable[[int], None]  # called with the number of files or traces that are done
@@ -107,7 +108,7 @@ class Dataset:
         label come first.
     """
 
-    X: NDArray[np.float32]
+    X: TraceArray
     y: NDArray[np.int8]
     name: str = "data"
     rate_hz: float | None = None
@@ -136,7 +137,7 @@ class Dataset:
         )
 
     @property
-    def cube(self) -> NDArray[np.float32]:
+    def cube(self) -> TraceArray:
         """The traces, shape (n, C, T) also for a single channel."""
         return self.X if self.X.ndim == 3 else self.X[:, None]
 
@@ -147,8 +148,9 @@ class Dataset:
         A rate or a unit that is unknown is None.
         """
         _, channels, samples = self.cube.shape
-        about = (self.rate_hz, channels, self.unit, self.limit, self.fit, self.channels)
-        return TraceSpec(samples, *about)
+        return TraceSpec(
+            samples, self.rate_hz, channels, self.unit, self.limit, self.fit, self.channels
+        )
 
     def to_frame(self) -> "pd.DataFrame":
         """Return a DataFrame with a row for each trace.
@@ -201,8 +203,12 @@ class Dataset:
         """
         most = self.X.shape[-1]
         least = most if self.fit == "resample" else 1
-        wanted = f"{least} to {most} samples of {self.name}"
-        expect_data(least <= samples <= most, wanted, samples, "resampled traces stay whole")
+        expect_data(
+            least <= samples <= most,
+            f"{least} to {most} samples of {self.name}",
+            samples,
+            "resampled traces stay whole",
+        )
         fit = "cut" if samples < most and self.fit == "pad" else self.fit
         return replace(self, X=np.ascontiguousarray(self.X[..., :samples]), fit=fit)
 
@@ -212,7 +218,7 @@ def make_dataset(
     y: ArrayLike,
     *,
     rate_hz: float | None = None,
-    channels: Names = (),
+    channels: Sequence[str] = (),
     part: Any = None,
     cause: Any = None,
     **about: Any,
@@ -276,7 +282,7 @@ def make_dataset(
         cube[:, 0] if n_channels == 1 else cube,
         y.astype(np.int8),
         rate_hz=rate_hz,
-        channels=channels,
+        channels=tuple(channels),
         part=None if parts is None else parts.astype(np.str_),
         cause=cause,
         **about,

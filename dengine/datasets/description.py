@@ -12,8 +12,8 @@ import difflib
 import re
 import sys
 import tomllib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, fields, is_dataclass, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
 
@@ -313,16 +313,7 @@ class Description:
         """
         version = values.get("version", VERSION)
         is_older = isinstance(version, int) and version <= VERSION
-        wanted = f"version {VERSION} of {where}"
-        expect_data(is_older, wanted, version, "install a newer dengine")
-        channels = values.get("channels")
-        if isinstance(channels, Mapping):
-            channels = {
-                column: about if isinstance(about, Mapping) else {"unit": about}
-                for column, about in channels.items()
-                if column != UNKNOWN
-            }
-            values = {**values, "channels": channels}
+        expect_data(is_older, f"version {VERSION} of {where}", version, "install a newer dengine")
         return _made(cls, values, where)  # type: ignore[no-any-return]
 
     @classmethod
@@ -388,13 +379,13 @@ class Description:
         """Return the lines of one section of the TOML file; the note on a key stands above it.
 
         Notes on keys that the section does not have come first. Empty notes are left out; a
-        character that does not print becomes a blank.
+        control character becomes a blank.
 
         prefix : the name of the section with a dot, like `label.`, with which the keys of its notes
         begin; "" for the keys outside of all sections. table : the values of the section by key.
         """
         notes = {
-            key.removeprefix(prefix): "".join(c if c.isprintable() else " " for c in note)
+            key.removeprefix(prefix): re.sub(r"[\x00-\x1f\x7f]", " ", note)
             for key, note in self.notes.items()
             if note and key.startswith(prefix) and (prefix or key.partition(".")[0] not in SECTIONS)
         }
@@ -410,6 +401,11 @@ class Description:
         return (self.label, *self.check)
 
     @property
+    def is_cut(self) -> bool:
+        """Whether long recordings are cut into parts, as `[windows]` says."""
+        return bool(self.windows.trigger or self.windows.listing)
+
+    @property
     def open_keys(self) -> Words:
         """The keys whose value is or contains `?`, like `label.column`.
 
@@ -417,10 +413,9 @@ class Description:
         counted. In `[[check]]` it is a word that no recording has, and recordings with other words
         become faults.
         """
-        values = self.to_dict()
-        values.pop("ignored", None)
-        open_channels = ["channels"] if UNKNOWN in values["channels"] else []
-        return (*_open_keys(values), *open_channels)
+        values = flat("", {**self.to_dict(), "ignored": {}})
+        keys = [k for k, v in values.items() if UNKNOWN in (v if isinstance(v, list) else [v])]
+        return tuple(keys if self.channels else [*keys, "channels"])
 
     def with_values(self, stated: Stated) -> "Description":
         """Return a description in which the given keys, like `label.column`, have these values.
@@ -434,9 +429,9 @@ class Description:
         before the dot in a key is no section.
         """
         values = self.to_dict()
-        for section, sources in SOURCES.items():
-            if any(f"{section}.{source}" in stated for source in sources):
-                for source in sources:
+        for section in ("label", "part"):
+            if any(f"{section}.{source}" in stated for source in SOURCES):
+                for source in SOURCES:
                     values.get(section, {}).pop(source, None)
         for name, value in stated.items():
             of_column = OF_COLUMN.fullmatch(name)
@@ -444,8 +439,7 @@ class Description:
             table = values
             for step in steps:
                 table = table.setdefault(step, {})
-                wanted = f"a section before the dot in {name}"
-                expect_data(isinstance(table, dict), wanted, step)
+                expect_data(isinstance(table, dict), f"a section before the dot in {name}", step)
             table[last] = value
         return replace(Description.from_dict(values), notes=self.notes)
 
@@ -476,11 +470,8 @@ SECTIONS: dict[str, Any] = {
     "traces": TraceForm,
     "seen": Seen,
 }
-# Keys of which one states where something stands, and the others are cleared.
-SOURCES = {
-    "label": ("column", "path", "line", "topic", "listing"),
-    "part": ("column", "path", "line"),
-}
+# Keys of which one states where a label or part number stands, and the others are cleared.
+SOURCES = ("column", "path", "line", "topic", "listing")
 # Keys of one column, whose name may have dots in it: `rows.Status of A.1.keep`.
 OF_COLUMN = re.compile(r"(rows|channels)\.(.+)\.(keep|drop|invalid|unit|factor|limit)", re.DOTALL)
 KINDS: dict[Any, str] = {
@@ -496,10 +487,10 @@ def _made(kind: Any, value: Any, where: str) -> Any:
     """Return a value of a TOML file, converted to `kind`, the annotated type of its key.
 
     A table becomes a dataclass or a dict, and a list a tuple; so does a single value if several are
-    expected. `?` may stand in place of a text, number, boolean or choice. A number or boolean
-    becomes a text if only a text is expected, and a whole number a float if a number is. Raises
-    DataError for an unknown key or choice, for a value of another type, and for a number that is
-    not finite if a number is expected; `where` is its name in the message.
+    expected. `?` may stand in place of a text, number, boolean or choice, and of a mapping its key
+    `?` is left out. A single value in place of a `Channel` is its unit. Raises DataError for an
+    unknown key or choice, and for a value of another type (see `_as_kind`); `where` is its name in
+    the message.
     """
     origin = get_origin(kind)
     args = get_args(kind)
@@ -509,17 +500,21 @@ def _made(kind: Any, value: Any, where: str) -> Any:
     if origin is Literal and value != UNKNOWN:
         expect_one_of(args, str(value), where)
         return value
-    if origin is not Mapping and not is_dataclass(kind):
+    if origin is Literal or kind in KINDS:
         return _as_kind(kind, value, where)
+    if kind is Channel and not isinstance(value, Mapping):
+        value = {"unit": value}
     expect_data(isinstance(value, Mapping), f"{where} to be a table", value)
     if origin is Mapping:
-        return {str(name): _made(args[1], v, f"{where}.{name}") for name, v in value.items()}
+        return {
+            str(name): _made(args[1], item, f"{where}.{name}")
+            for name, item in value.items()
+            if name != UNKNOWN
+        }
     keys = {about.name: about.type for about in fields(kind) if about.compare}
-    values = {}
-    for name, item in value.items():
+    for name in value:
         expect_one_of(keys, name, where)
-        values[name] = _made(keys[name], item, f"{where}, {name}")
-    return kind(**values)
+    return kind(**{name: _made(keys[name], value[name], f"{where}, {name}") for name in value})
 
 
 def _as_kind(kind: Any, value: Any, where: str) -> Any:
@@ -535,8 +530,9 @@ def _as_kind(kind: Any, value: Any, where: str) -> Any:
         return value
     if kind is str and isinstance(value, int | float):
         return str(value)
-    is_kind = isinstance(value, int | float if kind is float else kind)
-    is_kind = is_kind and isinstance(value, bool) == (kind is bool)
+    is_kind = isinstance(value, bool) == (kind is bool) and (
+        isinstance(value, kind) or (kind is float and isinstance(value, int))
+    )
     is_finite = kind is not float or (is_kind and abs(value) <= sys.float_info.max)
     expect_data(is_kind and is_finite, f"{KINDS[kind]} in {where}", value)
     return float(value) if kind is float else value
@@ -566,13 +562,20 @@ def _plain(value: Any) -> Any:
     return {k: _plain(v) for k, v in values.items() if v != getattr(default, k)}
 
 
-def _open_keys(values: Stated, prefix: str = "") -> Iterator[str]:
-    """Yield each key of nested dicts, like `label.column`, that is `?` or a list that has `?`."""
-    for name, value in values.items():
-        if isinstance(value, Mapping):
-            yield from _open_keys(value, f"{prefix}{name}.")
-        elif value == UNKNOWN or (isinstance(value, list) and UNKNOWN in value):
-            yield prefix + name
+def flat(prefix: str, value: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a nested mapping as one dict: `{"a": {"b": 1}}` becomes `{"a.b": 1}`.
+
+    An empty mapping within it is left out. If two keys become equal, the later one counts.
+
+    prefix : text that is put before each key. value : the mapping.
+    """
+    items: dict[str, Any] = {}
+    for name, item in value.items():
+        if isinstance(item, Mapping):
+            items |= flat(f"{prefix}{name}.", item)
+        else:
+            items[f"{prefix}{name}"] = item
+    return items
 
 
 def _toml_key(name: str) -> str:
@@ -586,9 +589,9 @@ def _toml_value(value: Any) -> str:
     A dict is written in one line, `{ unit = "N", factor = 2.0 }`; but if it has only a unit, as
     this text. A list of one item is written as that item.
     """
-    if isinstance(value, Mapping) and {*value} == {"unit"}:
-        return _toml_value(value["unit"])
     if isinstance(value, Mapping):
+        if {*value} == {"unit"}:
+            return _toml_value(value["unit"])
         pairs = (f"{_toml_key(name)} = {_toml_value(item)}" for name, item in value.items())
         return f"{{ {', '.join(pairs)} }}"
     if isinstance(value, list) and len(value) == 1:

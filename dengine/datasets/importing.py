@@ -8,7 +8,6 @@ other ids. `export.cell_journal` imports the journals of exported cells by `impo
 """
 
 import math
-import os
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -81,18 +80,20 @@ def check_agreement(data: Dataset, trace_spec: TraceSpec) -> None:
     must both have the `fit` "resample", or neither. The number of channels is not compared.
     """
     spec = data.spec
-    fits = {spec.fit, trace_spec.fit}
-    is_same_fit = len(fits) == 1 or "resample" not in fits
-    is_fitted = is_same_fit and spec.samples == trace_spec.samples
-    wanted = f"recordings brought to {trace_spec.samples} samples by {trace_spec.fit}"
-    do = "state these in [traces], or what is known would count again"
-    is_fitted = is_fitted or data.lengths is None
-    expect(is_fitted, wanted, (spec.samples, spec.fit), do, TraceError)
+    is_resampled = {item.fit == "resample" for item in (spec, trace_spec)}
+    is_same = len(is_resampled) == 1 and spec.samples == trace_spec.samples
+    expect(
+        data.lengths is None or is_same,
+        f"recordings brought to {trace_spec.samples} samples by {trace_spec.fit}",
+        (spec.samples, spec.fit),
+        "state these in [traces], or what is known would count again",
+        TraceError,
+    )
     rates = (trace_spec.rate_hz, spec.rate_hz)
     is_rate = None in rates or math.isclose(*rates, rel_tol=RATE_TOLERANCE)  # type: ignore[arg-type]
     expect(is_rate, f"traces at {rates[0]} Hz", rates[1], "resample them", TraceError)
     names = trace_spec.columns
-    is_same = spec.columns == names or not (spec.columns and names)
+    is_same = spec.columns in ((), names) or not names
     expect(is_same, f"the channels {', '.join(names)}", spec.columns, "", TraceError)
 
 
@@ -194,7 +195,7 @@ def import_labelled(
         parts = list(zip(decisions, traces, map(as_success, data.y), strict=True))
         report = import_parts(engine.store, parts, trace_spec, engine.policy, on_traces)
     finally:
-        if isinstance(store, str | os.PathLike):
+        if opened is not store:
             engine.close()
     return replace(report, resumed=engine.resumed)
 
@@ -243,18 +244,23 @@ def import_parts(
     """
     gate = TraceGate(trace_spec.channels * trace_spec.samples)
     limit = trace_spec.limit or math.inf
-    counts: dict[str, Any] = dict.fromkeys(
-        ("imported", "quarantined", "repeated", "contradicted"), 0
-    )
+    counts: Any = Counter(imported=0, quarantined=0, repeated=0)
+    # The accepted parts without a report since the last label that counted them, or since the last
+    # change of the policy. Otherwise the next decision confirms an accepted part.
     counts_unreported = policy.stops == "some"
-    n_unreported = _count_unreported(store, policy)
+    n_unreported = 0
+    if counts_unreported:
+        since = int(store.settings.read().get("policy_since", 0))
+        n_unreported = len(store.decisions.unreported_accepts(since))
+        n_unreported -= store.labels.unreported_total(since)
     for start in range(0, len(parts), CHUNK):
         chunk = parts[start : start + CHUNK]
         new: dict[str, StoredDecision] = {}
         labels: dict[str, NewLabel] = {}
         for decision, trace, label in chunk:
-            earlier = new.get(decision.id) or store.decisions.get(decision.id)
-            reported = labels.get(decision.id) or earlier
+            id_ = decision.id
+            earlier = new.get(id_) or store.decisions.get(id_)
+            reported = labels.get(id_) or earlier
             if reported is not None and reported.source is not None:  # a forgotten one has a label
                 outcome = "repeated" if label == reported.success else "contradicted"
                 counts[outcome] += label is not None
@@ -263,7 +269,7 @@ def import_parts(
             if stored is None:
                 checked = gate(torch.from_numpy(trace), limit)
                 stored = _as_stored(decision, trace, checked, policy, store.clock())
-                new[decision.id] = stored
+                new[id_] = stored
             if counts_unreported and decision.action is Action.ACCEPT:
                 # A decision that was stored without a label was counted as unreported.
                 n_unreported += (label is None) - (earlier is not None)
@@ -272,25 +278,12 @@ def import_parts(
                 n_unreported -= n_since
                 source = source_of(decision, label)
                 about = (store.clock(), stored.content_hash, stored.time)
-                labels[decision.id] = NewLabel(decision.id, label, source, 0, None, n_since, *about)
+                labels[id_] = NewLabel(id_, label, source, 0, None, n_since, *about)
                 counts["quarantined" if stored.quarantined else "imported"] += 1
         store.apply_records([*new.values(), *labels.values()])
         if on_traces is not None:
             on_traces(len(chunk))
     return ImportReport(**counts, resumed=True)
-
-
-def _count_unreported(store: "SqlStore", policy: Policy) -> int:
-    """Return the number of unreported accepted parts since the last label that counted them.
-
-    Each label stores how many accepted parts before it had no report. Only parts since the last
-    change of the policy count. With `stops="all"` the number is 0, since the next decision confirms
-    an accepted part.
-    """
-    if policy.stops != "some":
-        return 0
-    since = int(store.settings.read().get("policy_since", 0))
-    return len(store.decisions.unreported_accepts(since)) - store.labels.unreported_total(since)
 
 
 def _as_stored(
@@ -304,10 +297,11 @@ def _as_stored(
     as quarantined. `time` is that of the decision, seconds since 1970.
     """
     fault, content = checked
-    is_certain = decision.predicted is not Action.VERIFY
-    propensity = policy.audited_share if is_certain else 1.0
-    reason = REASONS[fault] if fault else decision.reason
-    made = replace(decision, reason=reason, propensity=propensity)
+    made = replace(
+        decision,
+        reason=REASONS[fault] if fault else decision.reason,
+        propensity=1.0 if decision.predicted is Action.VERIFY else policy.audited_share,
+    )
     return StoredDecision(made, trace.copy(), trace_hash(content, made.part), bool(fault), time)
 
 

@@ -2,7 +2,6 @@
 
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from functools import partial
 from importlib.resources import files
 from pathlib import Path
@@ -78,8 +77,7 @@ def load_dataset(
     """
     stated = channels.split(",") if isinstance(channels, str) else channels or ()
     names = tuple(map(str.strip, stated))
-    expect_data(samples is None or samples >= 1, "1 or more samples", samples)
-    read = None if description is not None else own_reader(source)
+    read = own_reader(source) if description is None else None
     if read is not None:
         data = read()
         data = data.select(names) if names else data
@@ -89,10 +87,10 @@ def load_dataset(
         about = about.with_channels(names) if names else about
         traces = about.traces
         is_stated = isinstance(traces.samples, int) and traces.lengths != "resample"
-        if samples and not (is_stated and samples <= traces.samples):
-            about = replace(about, traces=replace(traces, samples=samples))
+        if samples is not None and not (is_stated and samples <= traces.samples):
+            about = about.with_values({"traces.samples": samples})
         data = read_recordings(place, about, progress)
-    return data.cut(samples) if samples else data
+    return data if samples is None else data.cut(samples)
 
 
 def saved_description(source: FilePath) -> Path:
@@ -134,8 +132,11 @@ def description_of(
         return Description.from_dict(description)
     if description is None:
         source = as_source(source)
-        wanted = "a description of the table, like the one that describe(table) proposes"
-        expect_data(isinstance(source, Path), wanted, None)
+        expect_data(
+            isinstance(source, Path),
+            "a description of the table, like the one that describe(table) proposes",
+            None,
+        )
         description = saved_description(source)
         if not description.is_file():
             proposal = describe(source, stated)
@@ -160,9 +161,9 @@ def missing_text(path: Path, proposal: Description) -> str:
     It lists the open keys of the proposed description, whose value is `?`, with the notes on them,
     and has the commands that show and save the proposal.
     """
-    notes = {key: proposal.notes.get(key, "") for key in proposal.open_keys}
-    questions = "".join(f"\n  {key}: {note}" for key, note in notes.items())
-    state = "".join(f" --set {key}=..." for key in notes)
+    keys = proposal.open_keys
+    questions = "".join(f"\n  {key}: {proposal.notes.get(key, '')}" for key in keys)
+    state = "".join(f" --set {key}=..." for key in keys)
     return (
         f"Expected the description {saved_description(path)}, found none. Look at the proposal "
         f"with `dengine data {path}`, and write it with `dengine data {path} --save{state}`."
@@ -186,8 +187,8 @@ def own_reader(source: Any) -> Callable[[], Dataset] | None:
         return lambda: make_dataset(*source)
     if hasattr(source, "columns"):
         return partial(_from_own_frame, source) if OWN in source.attrs else None
-    if str(source) in BUNDLED:
-        source = Path(str(files("dengine"))) / "data" / BUNDLED[str(source)]
+    if name := BUNDLED.get(str(source)):
+        source = Path(str(files("dengine"))) / "data" / name
     path = as_source(source)
     if path.is_file() and not saved_description(path).is_file():
         for is_own, read in OWN_FILES:
@@ -242,11 +243,12 @@ def _from_own_frame(frame: Any, name: str = "table") -> Dataset:
     its arrays, KeyError if it has no longer a column `label`, and ValueError if columns of samples
     are no numbers or their number is not that of `attrs`.
     """
-    about = frame.attrs[OWN]
+    about = {**frame.attrs[OWN]}
     words = frame[frame.columns.intersection(["part", "cause"])].astype(str)
     X = frame.drop(columns=["label", *words]).to_numpy(np.float32)
-    arrays = {**about, "X": X.reshape(len(X), about["n_channels"], -1), "y": frame["label"]}
-    return _from_arrays(arrays | {key: words[key].to_numpy(np.str_) for key in words}, name)
+    X = X.reshape(len(X), about.pop("n_channels"), -1)
+    about |= {key: words[key].to_numpy(np.str_) for key in words}
+    return make_dataset(X, frame["label"], name=name, **about)
 
 
 def _read_npz(path: Path) -> Dataset:
@@ -258,34 +260,22 @@ def _read_npz(path: Path) -> Dataset:
     """
     arrays, _ = read_archive(path, OWN_ARRAYS)
     with read_errors(path, "an .npz file of plain arrays"):
+        X = arrays["X"]
         if "scale" in arrays:
-            arrays["X"] = arrays["X"].astype(np.float32) * arrays["scale"].astype(np.float32)
-        return _from_arrays(arrays, path.stem)
-
-
-def _from_arrays(arrays: Stated, name: str) -> Dataset:
-    """Return the data set of arrays that are named like the fields of a `Dataset`.
-
-    X and y must be there; rate_hz, unit, channels, limit, fit, cause and part are used if they are
-    there, and any other array is ignored. `name` becomes the name of the data set. Raises DataError
-    if `make_dataset` refuses the arrays, and TypeError or ValueError if `rate_hz` is no number.
-    """
-    units, channels = (
-        tuple(map(str, np.atleast_1d(arrays.get(key, ())).tolist())) for key in ("unit", "channels")
-    )
-    rate_hz = arrays.get("rate_hz")
-    return make_dataset(
-        arrays["X"],
-        arrays["y"],
-        name=name,
-        rate_hz=rate_hz and float(rate_hz),
-        unit=unit_text(units),
-        channels=channels,
-        limit=arrays.get("limit"),
-        fit=arrays.get("fit", "strict"),
-        cause=arrays.get("cause"),
-        part=arrays.get("part"),
-    )
+            X = X.astype(np.float32) * arrays["scale"].astype(np.float32)
+        units, channels = (
+            [*map(str, np.atleast_1d(arrays.get(key, ())).tolist())] for key in ("unit", "channels")
+        )
+        return make_dataset(
+            X,
+            arrays["y"],
+            name=path.stem,
+            rate_hz=float(arrays["rate_hz"]) if "rate_hz" in arrays else None,
+            unit=unit_text(units),
+            channels=channels,
+            cause=arrays.get("cause"),
+            part=arrays.get("part"),
+        )
 
 
 def _read_store(path: Path) -> Dataset:
@@ -304,20 +294,26 @@ def _read_store(path: Path) -> Dataset:
 
     with opening(path, must_exist=True) as store:
         difference = store.database.check_integrity(0, since=0)
-        do = "see `dengine verify`, and restore a copy"
-        expect_data(not difference, f"{path} as its ledger has it", difference, do)
+        expect_data(
+            not difference,
+            f"{path} as its ledger has it",
+            difference,
+            "see `dengine verify`, and restore a copy",
+        )
         labelled = store.labels.with_traces()
         spec = stored_trace_spec(store.settings.read())
     store.close()
     if spec is None or not len(labelled.labels):
-        do = "record some first, as in shadow mode"
-        raise DataError(f"Expected a store with labelled traces, {path} has none; {do}.")
+        raise DataError(
+            f"Expected a store with labelled traces, {path} has none; record some first, as in "
+            "shadow mode."
+        )
     hashes = labelled.hashes
     return make_dataset(
         labelled.traces,
         labelled.labels,
         # As the store counts: a part that came again has one vote.
-        part=hashes if len({*hashes.tolist()}) < len(hashes) else None,
+        part=hashes if len(np.unique(hashes)) < len(hashes) else None,
         name=path.stem,
         rate_hz=spec.rate_hz,
         unit=unit_text(spec.units),

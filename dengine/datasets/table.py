@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import DataError, instead, listed, shortened
-from ..records import Floats
+from ..records import Floats, TraceArray
 from .description import TextForm
 
 Cells = NDArray[Any]
@@ -46,7 +46,7 @@ class Table:
     columns : mapping of str to array, shape (rows,)
         Numbers, times, or texts as objects. In a file of a single part a column with one cell holds
         for all rows.
-    lines : sequence of int
+    lines : sequence or array of int
         Line in the file of each row, or one line for all rows.
     units : mapping of str to str
         Units that the file states for its columns.
@@ -66,7 +66,7 @@ class Table:
 
     source: str
     columns: Mapping[str, Cells]
-    lines: Sequence[int]
+    lines: Sequence[int] | Cells
     units: Mapping[str, str] = field(default_factory=dict)
     above: Sequence[str] = ()
     header: int = 0
@@ -80,8 +80,9 @@ class Table:
         Raises UnreadableError if there is no column of this name.
         """
         if name not in self.columns:
-            columns = listed(self.columns) or "none"
-            raise UnreadableError(f"Expected a column {name}, got {columns}", self.header, name)
+            raise UnreadableError(
+                f"Expected a column {name}, got {listed(self.columns) or 'none'}", self.header, name
+            )
         return self.columns[name]
 
     def whole(self) -> "Table":
@@ -96,11 +97,9 @@ class Table:
         Their line numbers are selected, too. A column of one cell, and a single line number, hold
         for all rows and stay, even if no row is selected; so do `damage`, `origin` and all else.
         """
-        lines = self.lines
-        if len(lines) > 1:
-            lines = lines[rows] if isinstance(rows, slice) else np.asarray(lines)[rows]
         columns = {name: c[rows] if len(c) > 1 else c for name, c in self.columns.items()}
-        return replace(self, columns=columns, lines=lines)
+        lines = np.asarray(self.lines)
+        return replace(self, columns=columns, lines=lines[rows] if len(lines) > 1 else lines)
 
     def words(self, name: str) -> Cells:
         """Return the cells of a column as texts, without blanks around them.
@@ -183,19 +182,17 @@ class Recording:
         Number of the part; "" if none is stated.
     length : int
         Number of samples as recorded.
-    start : float
-        Time of the first sample in seconds, counted from the clock's own zero; NaN without a clock.
-    rank : str
-        Word in the column that `order` names, by which recordings are sorted; "" for other orders.
+    rank : object
+        What recordings are sorted by, of one type for all: the time of the first sample, or the
+        `natural_key` of a path or word, as `order` in the description says; "" for order `name`.
     """
 
     source: str
-    trace: NDArray[np.float32]
+    trace: TraceArray
     label: int
     part: str
     length: int
-    start: float
-    rank: str
+    rank: Any
 
 
 def as_word(cell: Any) -> str:
@@ -216,7 +213,8 @@ def pattern_of(decimal: str, thousands: str) -> re.Pattern[str]:
     `decimal` is its decimal mark, and `thousands` the mark that may stand between groups of three
     digits; "" allows no groups.
     """
-    mark, point = re.escape(thousands), re.escape(decimal)
+    mark = re.escape(thousands)
+    point = re.escape(decimal)
     groups = rf"[1-9]\d{{0,2}}(?:{mark}\d{{3}})+|" if mark else ""
     digits = rf"(?:(?:{groups}\d+)(?:{point}\d*)?|{point}\d+)"
     return re.compile(rf"[-+{MINUS}]?{digits}(?:[eE][-+]?\d+)?", re.ASCII)

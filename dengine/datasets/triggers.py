@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from ..errors import SettingError, shortened
 from ..records import Floats
 
-Signals = Mapping[str, Floats]  # (n,) each
 MAX_STEP = 1.5  # steps from one sample to the next if none is missing
 
 
@@ -51,7 +50,7 @@ class Trigger:
         vector = (f"{self.signal}[0]", f"{self.signal}[1]", f"{self.signal}[2]")
         return vector if self.kind == "motion" else (self.signal,)
 
-    def active(self, signals: Signals) -> NDArray[np.bool_]:
+    def active(self, signals: Mapping[str, Floats]) -> NDArray[np.bool_]:
         """Return whether the condition is met at each sample, (n,) bool; False if a signal is NaN.
 
         signals : arrays of shape (n,) by the names of the signals.
@@ -125,11 +124,14 @@ class Start(NamedTuple):
     """
 
     time: float
-    seen: bool = True
+    seen: bool
 
 
+@dataclass(slots=True)
 class StartFinder:
     """Finds where a trigger starts, sample by sample.
+
+    A trigger that is on at the first sample is no start.
 
     Parameters
     ----------
@@ -139,15 +141,10 @@ class StartFinder:
         Seconds that the trigger must have been off before a start.
     """
 
-    def __init__(self, step: float, quiet_s: float = 0.0) -> None:
-        self.step = step
-        self.quiet_s = quiet_s
-        self.forget()
-
-    def forget(self) -> None:
-        """Forget all samples. A trigger that is on at the next one is no start."""
-        self._off_since: float | None = None
-        self._last_off = 0.0
+    step: float
+    quiet_s: float = 0.0
+    _off_since: float | None = None
+    _last_off: float = 0.0
 
     def feed(self, time: float, active: bool) -> Start | None:
         """Take the next sample; return where an insertion begins if the sample shows it, else None.
@@ -170,7 +167,7 @@ class StartFinder:
         if off_since is None or time - off_since < self.quiet_s - self.step / 2:
             return None
         seen = time - self._last_off < MAX_STEP * self.step
-        return Start(time) if seen else Start(self._last_off + self.step, seen=False)
+        return Start(time if seen else self._last_off + self.step, seen)
 
 
 def place(

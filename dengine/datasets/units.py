@@ -7,8 +7,6 @@ import re
 import tomllib
 from importlib.resources import files
 
-from ..errors import DataError
-
 TABLE = tomllib.loads((files("dengine") / "data" / "units.toml").read_text("utf-8"))
 OTHERS = TABLE.pop("others")["units"]
 # Each unit with its quantity and the factor to that quantity's first.
@@ -36,20 +34,19 @@ def is_unit(text: str) -> bool:
     return bare(text) in OTHERS or bare(text) in UNITS
 
 
-def conversion(unit: str, wanted: str) -> float:
+def conversion(unit: str, wanted: str) -> float | None:
     """Return the factor from a unit to the unit `wanted`; 1 if they are the same or either is "".
 
-    Brackets around a unit are ignored. Raises DataError if the units are of different quantities,
-    like force and length, or if they differ and one is unknown.
+    Brackets around a unit are ignored. None if the units are of different quantities, like force
+    and length, or if they differ and one is unknown.
     """
-    unit, wanted = bare(unit), bare(wanted)
-    if not unit or not wanted:
+    units = (bare(unit), bare(wanted))
+    if not all(units):
         return 1.0
-    quantity, factor = UNITS.get(unit, (f"unknown {unit}", 1.0))
-    other, wanted_factor = UNITS.get(wanted, (f"unknown {wanted}", 1.0))
-    if quantity != other:
-        raise DataError(f"Expected the unit {wanted}, or one that converts to it, got {unit}")
-    return factor / wanted_factor
+    (quantity, factor), (other, wanted_factor) = (
+        UNITS.get(name, (f"unknown {name}", 1.0)) for name in units
+    )
+    return factor / wanted_factor if quantity == other else None
 
 
 def unit_in(name: str) -> str:

@@ -230,6 +230,6 @@ class RtdeRecorder(AbstractContextManager["RtdeRecorder"]):
 
     def _reset(self) -> None:
         """Discard the packages and the start of an insertion that has begun; look for the next."""
-        self._finder.forget()
+        self._finder = StartFinder(self._step, self.trigger.quiet_s)
         self._rows = []
         self._start = None

@@ -19,9 +19,9 @@ import numpy as np
 from ...errors import DataError, listed
 from ..checks import check_text
 from ..dataset import Fault
-from ..description import UNKNOWN, Description
+from ..description import UNKNOWN, Description, flat
 from ..read.files import as_source, caught, match_files, natural_key, read_file
-from ..read.frames import flat, read_frame, read_npz
+from ..read.frames import read_frame, read_npz
 from ..read.places import without_suffix
 from ..read.split import table_of
 from ..read.text import read_text

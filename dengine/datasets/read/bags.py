@@ -23,13 +23,11 @@ from .frames import as_cells
 from .split import signals_of, verdicts_of
 
 SUFFIX = ".mcap"
-STAMP, LOG_TIME = "stamp", "log_time"
-Message = tuple[str, int, Any]  # topic, nanoseconds of the log, message
-Files = Sequence[tuple[Path, str]]
-Events = dict[str, list[tuple[int, Any]]]  # by topic: nanoseconds of the log, data
+STAMP = "stamp"
+LOG_TIME = "log_time"
 
 
-def read_messages(path: Path, topics: Collection[str] | None) -> Iterator[Message]:
+def read_messages(path: Path, topics: Collection[str] | None) -> Iterator[tuple[str, int, Any]]:
     """Yield (topic, time in ns, message) for each message of some topics, in the file's order.
 
     The time is that of the bag's log. `topics` None means all topics. Raises DataError if the file
@@ -62,10 +60,7 @@ def read_messages(path: Path, topics: Collection[str] | None) -> Iterator[Messag
 
 
 def read_bag(
-    files: Files,
-    title: str,
-    description: Description,
-    faults: list[Fault],
+    base: Path, names: Sequence[str], title: str, description: Description, faults: list[Fault]
 ) -> Table:
     """Return a table with a row for each message that has the channels, in the order of `log_time`.
 
@@ -78,8 +73,10 @@ def read_bag(
 
     Parameters
     ----------
-    files : sequence of (Path, str)
-        The files of the bag in their order, each with its name for error messages.
+    base : Path
+        The folder of the bag.
+    names : sequence of str
+        The files of the bag in their order.
     title : str
         The bag's name in error messages.
     description : Description
@@ -103,8 +100,26 @@ def read_bag(
         raise DataError(f"Expected channels of one topic, got {listed(sorted(topics))}.")
     verdicts = verdicts_of(description)
     others = verdicts.union(description.part.column, signals_of(description), [description.order])
-    events: Events = {name: [] for name in others if name.startswith("/") and "." not in name}
-    rows = _rows_of(files, description, topics, events, faults)
+    # by topic: nanoseconds of the log, data
+    events: dict[str, list[tuple[int, Any]]] = {
+        name: [] for name in others if name.startswith("/") and "." not in name
+    }
+    fields = [attrgetter(column.partition(".")[2]) for column in columns]
+    rows: list[Any] = []
+    for name in names:
+        if description.windows.trigger and faults:
+            raise DataError(
+                f"Expected whole files before {name}, since a trigger cuts: {faults[0]}"
+            )
+        with caught(faults, name), instead(UnreadableError, "Expected a field", AttributeError):
+            for topic, logged, message in read_messages(base / name, {*topics, *events}):
+                if topic in events:
+                    events[topic].append((logged, message.data))
+                if topic in topics:
+                    rows.append((logged, _stamp_of(message), *(field(message) for field in fields)))
+    if not rows:
+        why = f" {faults[0]}." if faults else ""
+        raise DataError(f"Expected messages of {listed(topics)}, found none.{why}")
     rows.sort(key=itemgetter(0))
     cells = map(as_cells, zip(*rows, strict=True))
     table = dict(zip((LOG_TIME, STAMP, *columns), cells, strict=True))
@@ -113,44 +128,10 @@ def read_bag(
     return Table(title, table, [])
 
 
-def _rows_of(
-    files: Files,
-    description: Description,
-    topics: set[str],
-    events: Events,
-    faults: list[Fault],
-) -> list[Any]:
-    """Return a row (log time, header time, *values) of each message with the channels.
-
-    Times are in nanoseconds; the header time is 0 without a header. The values are the fields that
-    are the channels. `files` has the path and the name in errors of each file, and `topics` the
-    topic of the channels. Messages of topics that are keys of `events` are appended there as (log
-    time, data); others are not read. For a file that cannot be read or is damaged, or has a message
-    that lacks a field, a fault is appended to `faults`, and what came before stays. Raises
-    DataError if no message has the channels, or if a trigger cuts the bag and `faults` has any
-    before its last file.
-    """
-    fields = [attrgetter(column.partition(".")[2]) for column in description.channels]
-    rows: list[Any] = []
-    for path, name in files:
-        if description.windows.trigger and faults:
-            raise DataError(
-                f"Expected whole files before {name}, since a trigger cuts: {faults[0]}"
-            )
-        with caught(faults, name), instead(UnreadableError, "Expected a field", AttributeError):
-            for topic, logged, message in read_messages(path, {*topics, *events}):
-                if topic in events:
-                    events[topic].append((logged, message.data))
-                if topic in topics:
-                    values = [field(message) for field in fields]
-                    # in nanoseconds; 0 without a header
-                    stamp = getattr(getattr(message, "header", None), "stamp", None)
-                    stamped = stamp.sec * 10**9 + stamp.nanosec if stamp else 0
-                    rows.append((logged, stamped, *values))
-    if not rows:
-        why = f" {faults[0]}." if faults else ""
-        raise DataError(f"Expected messages of {listed(topics)}, found none.{why}")
-    return rows
+def _stamp_of(message: Any) -> int:
+    """Return the time in a message's header, in nanoseconds; 0 without a header."""
+    stamp = getattr(getattr(message, "header", None), "stamp", None)
+    return stamp.sec * 10**9 + stamp.nanosec if stamp else 0
 
 
 def _cells_of(messages: list[tuple[int, Any]], logs: Cells, is_verdict: bool) -> Cells:
@@ -165,9 +146,8 @@ def _cells_of(messages: list[tuple[int, Any]], logs: Cells, is_verdict: bool) ->
     """
     messages.sort(key=itemgetter(0))
     times = [time for time, _ in messages]
-    words = [word for _, word in messages]
+    words = [None, *(word for _, word in messages)]
     places = np.searchsorted(times, logs, side="left" if is_verdict else "right")
-    if not is_verdict:
-        return as_cells([words[i - 1] if i else None for i in places])
-    is_new = np.diff(places, append=len(times)) > 0
-    return as_cells([words[i] if new else None for i, new in zip(places, is_new, strict=True)])
+    if is_verdict:
+        places = np.where(np.diff(places, append=len(times)) > 0, places + 1, 0)
+    return as_cells([words[place] for place in places])

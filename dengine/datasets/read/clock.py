@@ -2,7 +2,6 @@
 
 import re
 from contextlib import suppress
-from zoneinfo import ZoneInfo
 
 import numpy as np
 
@@ -17,7 +16,6 @@ ISO = "iso"
 DAY = UNITS["d"]
 RATE_TOLERANCE = 0.03  # by which the rate of a recording's own times may differ from the stated one
 DATES = re.compile(r"%[dDjeyYxcmbB]")
-WHOLE = re.compile(r"-?\d{1,18}", re.ASCII)
 Times = tuple[Floats, float]  # the seconds of each row since the first, and the time of the first
 
 
@@ -37,16 +35,20 @@ def scale_of(unit: str) -> float:
     The units are s, sec, ms, us, µs, ns, min, h and d. Raises DataError for any other text.
     """
     match = re.fullmatch(r"(\d*\.?\d*)\s*([^\d.]+)", unit.strip())
-    if not match or match[2].strip() not in UNITS:
+    if not match or match[2] not in UNITS:
         raise DataError(
             f"Expected time.format to be a unit of time of {', '.join(UNITS)}, {ISO}, or a form "
             f"like %d.%m.%Y, got {unit!r}."
         )
-    return float(match[1].strip(".") or 1) * UNITS[match[2].strip()]
+    return float(match[1].strip(".") or 1) * UNITS[match[2]]
 
 
 def times_of(table: Table, clock: Clock, form: TextForm) -> Times:
     """Return the time of each row in seconds since the first row, and the time of the first row.
+
+    If times of day fall from one row to the next by more than half a day, midnight has passed,
+    unless a column of the clock has the date. If a counter falls by more than half of `clock.wrap`,
+    it began again at 0; with a `wrap` of 0 times may fall.
 
     Parameters
     ----------
@@ -54,7 +56,8 @@ def times_of(table: Table, clock: Clock, form: TextForm) -> Times:
         The rows of a recording.
     clock : Clock
         The section `[time]`, which has passed `check_clock`. The times in its columns are added up;
-        a column of one cell holds for all rows. Without columns there is one time, 0.
+        a column of one cell holds for all rows, and a column of datetimes needs no format. Without
+        columns there is one time, 0.
     form : TextForm
         The section `[text]`: how numbers are written.
 
@@ -68,52 +71,37 @@ def times_of(table: Table, clock: Clock, form: TextForm) -> Times:
     Raises
     ------
     UnreadableError
-        If a column is missing, empty or of another length, or a cell is no time of the stated form,
-        or no single time because clocks are changed.
+        If a column is missing, empty or of another length, or a cell is no time of the stated form
+        (a missing number, too), or no single time because clocks are changed.
     DataError
         If a format is no unit of time.
     """
     seconds: Floats = np.zeros(1)
     start = 0.0
     for name, unit in zip(clock.column, clock.format, strict=True):
-        relative, first = column_times(table, name, unit, clock, form)
-        if len({1, len(seconds), len(relative)}) > 2:
-            raise UnreadableError(
-                f"Expected {len(seconds)} times, got {len(relative)}", column=name
-            )
-        seconds = seconds + relative
+        cells = table.column(name)
+        if not len(cells):
+            raise UnreadableError("Expected times, got none", column=name)
+        is_date = cells.dtype.kind == "M"
+        if is_date or is_dated(unit):
+            values, first = _dates(table, name, unit, clock)
+            period = 0.0 if is_date or any(map(has_day, clock.format)) else DAY
+        else:
+            scale = scale_of(unit)
+            times: Cells = table.numbers(name, form)
+            table.refuse(np.isnan(times), "a time", name)
+            with suppress(ValueError, OverflowError):
+                whole = cells.astype(np.int64)  # too long for a float, as nanoseconds are
+                times = whole if (whole == times).all() else times
+            values = (times - times[0]) * scale
+            first = float(times[0]) * scale
+            period = clock.wrap * scale
+        if len({1, len(seconds), len(values)}) > 2:
+            raise UnreadableError(f"Expected {len(seconds)} times, got {len(values)}", column=name)
+        begins_again = np.diff(values, prepend=0.0) < -period / 2
+        seconds = seconds + (values + np.cumsum(begins_again) * period)
         start += first
     return seconds, start
-
-
-def column_times(table: Table, name: str, unit: str, clock: Clock, form: TextForm) -> Times:
-    """Return the times of one column in seconds since its first row, and the time of that row.
-
-    `unit` is the unit of its cells, or the form of its dates or times of day; a column of datetimes
-    needs neither. If times of day fall from one row to the next by more than half a day, midnight
-    has passed, unless a column of the clock has the date. If a counter falls by more than half of
-    `clock.wrap`, it began again at 0; with a `wrap` of 0 times may fall. `form` says how numbers
-    are written. Raises UnreadableError if the column `name` is missing or empty, or a cell is no
-    such time (a missing number, too), and DataError if `unit` is no unit of time.
-    """
-    cells = table.column(name)
-    if not len(cells):
-        raise UnreadableError("Expected times, got none", column=name)
-    is_date = cells.dtype.kind == "M"
-    if is_date or is_dated(unit):
-        values, first = _dates(table, name, unit, clock)
-        period = 0.0 if is_date or any(map(has_day, (unit, *clock.format))) else DAY
-    else:
-        scale = scale_of(unit)
-        times: Cells = table.numbers(name, form)
-        table.refuse(np.isnan(times), "a time", name)
-        with suppress(ValueError, OverflowError):
-            whole = cells.astype(np.int64)  # too long for a float, as nanoseconds since 1970 are
-            times = whole if (whole == times).all() else times
-        values = (times - times[0]) * scale
-        first = float(times[0]) * scale
-        period = clock.wrap * scale
-    return values + np.cumsum(np.diff(values, prepend=0.0) < -period / 2) * period, first
 
 
 def _dates(table: Table, name: str, unit: str, clock: Clock) -> Times:
@@ -138,12 +126,13 @@ def _dates(table: Table, name: str, unit: str, clock: Clock) -> Times:
     ):
         times = pd.to_datetime(texts, format=form, errors="coerce")
         if times.dt.tz is None:
-            zone = ZoneInfo(clock.zone) if clock.zone and has_date else "UTC"
+            zone = (has_date and clock.zone) or "UTC"
             times = times.dt.tz_localize(zone, ambiguous="infer")
     table.refuse(times.isna().to_numpy(), f"a time of the form {unit}", name)
+    first = times.iloc[0]
     zero = pd.Timestamp("1970-01-01" if has_date else "1900-01-01", tz="UTC")
-    values = (times - times.iloc[0]).dt.total_seconds().to_numpy(np.float64)
-    return values, (times.iloc[0] - zero).total_seconds()
+    values = (times - first).dt.total_seconds().to_numpy(np.float64)
+    return values, (first - zero).total_seconds()
 
 
 def check_steps(seconds: Floats, clock: Clock, table: Table) -> None:
@@ -161,8 +150,8 @@ def check_steps(seconds: Floats, clock: Clock, table: Table) -> None:
     n = len(steps)
     span = float(seconds[-1] - seconds[0])
     most = clock.gap / rate if rate else clock.gap * span / max(n, 1)
-    is_equal = (steps == 0) & (clock.gap > 0 or span == 0)
-    is_bad = (steps < 0) | is_equal | (steps > (most or np.inf))
+    is_bad = steps <= 0 if clock.gap or not span else steps < 0
+    is_bad |= steps > (most or np.inf)
     if is_bad.any():
         row = int(is_bad.argmax()) + 1
         raise UnreadableError(

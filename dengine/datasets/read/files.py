@@ -17,10 +17,9 @@ from ..table import UnreadableError
 GZIP = ".gz"
 DATE = re.compile(r"(?<![0-9])([0-9]{2})\.([0-9]{2})\.([0-9]{4})(?![0-9])")
 BAD = (ValueError, NotImplementedError, OSError, IndexError)  # what an unusable pattern raises
-Key = list[tuple[int, int, str]]
 
 
-def natural_key(text: str) -> Key:
+def natural_key(text: str) -> list[tuple[int, int, str]]:
     """Return a key that sorts runs of digits in texts by their size: run_2 before run_10.
 
     Decimals and signs do not count: 0.5 is before 0.25. Dates like 31.12.2025 are sorted by year,
@@ -60,19 +59,19 @@ def match_files(root: Path, patterns: Sequence[str]) -> set[str]:
     return {path.relative_to(root).as_posix() for path in paths if path.is_file()}
 
 
-def find_files(root: Path, description: Description) -> list[tuple[Path, str]]:
-    """Return the path of each file that a description names, with its path relative to the folder.
+def find_files(root: Path, description: Description) -> list[str]:
+    """Return the files that a description names, as paths relative to the folder.
 
     They are sorted by file name, run_2 before run_10. Listings, the description file and files that
-    match a pattern in `exclude` are left out. If `root` is a file, only that is returned, with its
-    name, whatever the description says. Raises DataError if no file is left, or for a malformed
-    pattern in `files`.
+    match a pattern in `exclude` are left out. If `root` is a file, its name alone is returned,
+    whatever the description says. Raises DataError if no file is left, or for a malformed pattern
+    in `files`.
     """
     if root.is_file():
-        return [(root, root.name)]
-    names = match_files(root, description.files)
-    names -= {source.listing for source in description.labels}
-    names -= {FOLDER_FILE, description.windows.listing}
+        return [root.name]
+    aside = {FOLDER_FILE, description.windows.listing}
+    aside |= {source.listing for source in description.labels}
+    names = match_files(root, description.files) - aside
     for pattern in description.exclude:
         names -= {*fnmatch.filter(names, pattern)}
     if not names:
@@ -80,8 +79,7 @@ def find_files(root: Path, description: Description) -> list[tuple[Path, str]]:
             f"Expected files {', '.join(description.files)} in {root}, found none; is it the "
             f"description of another folder? See `dengine data {root}`."
         )
-    files = [(root / name, name) for name in names]
-    return sorted(files, key=lambda item: (natural_key(item[0].name), natural_key(item[1])))
+    return sorted(names, key=lambda name: (natural_key(Path(name).name), natural_key(name)))
 
 
 def read_file(path: Path) -> bytes:
@@ -110,5 +108,6 @@ def caught(faults: list[Fault], source: str) -> Iterator[None]:
     try:
         yield
     except DataError as error:
-        line, column = getattr(error, "line", 0), getattr(error, "column", "")
-        faults.append(Fault(source, line, str(error).rstrip("."), column))
+        message = str(error).rstrip(".")
+        line = getattr(error, "line", 0)
+        faults.append(Fault(source, line, message, getattr(error, "column", "")))

@@ -7,20 +7,22 @@ list of objects has a column for each of their keys.
 
 import io
 import json
+import re
 from collections.abc import Mapping
-from itertools import chain, zip_longest
+from itertools import chain
 from typing import Any
 
 import numpy as np
 
 from ...errors import instead, shortened
 from ...files import read_archive, read_errors
-from ..description import TextForm
+from ..description import TextForm, flat
 from ..table import Cells, Table, UnreadableError
 from .text import to_utf8
 
-DAMAGES = (LookupError, TypeError, ValueError)  # of lists of several forms
+ITEMS = (list, np.ndarray)
 Columns = dict[str, Cells]
+Rows = list[tuple[int, Mapping[str, Any]]]  # the line of each, and its cells by column
 
 
 def read_objects(content: bytes, source: str, form: TextForm, has_lines: bool) -> Table:
@@ -34,39 +36,31 @@ def read_objects(content: bytes, source: str, form: TextForm, has_lines: bool) -
     know.
     """
     text = to_utf8(content, form.encoding).decode()
-    rows: list[Mapping[str, Any]] = []
-    numbers: list[int] = []
+    rows: Rows = []
     for number, line in enumerate(text.split("\n"), 1) if has_lines else [(0, text)]:
         try:
             value = json.loads(line.strip() or "[]")
         except (ValueError, RecursionError) as error:
             do = "" if has_lines else '; if each line is an object, state format="jsonl"'
             raise UnreadableError(f"Expected JSON: {error}{do}", number) from error
-        items = value if isinstance(value, list) else [value]
-        for item in items:
+        for item in value if isinstance(value, list) else [value]:
             if not isinstance(item, Mapping):
                 raise UnreadableError(f"Expected an object of JSON, got {shortened(item)}", number)
-            rows.append(flat("", item))
-        numbers += [number] * len(items)
-    if not rows:
-        raise UnreadableError("Expected objects of JSON, got none")
-    names = dict.fromkeys(chain(*rows))
-    columns = {name: as_cells([row.get(name) for row in rows]) for name in names}
-    return Table(source, columns, numbers)
+            rows.append((number, flat("", item)))
+    return _table_of(source, rows, "objects of JSON")
 
 
-def flat(prefix: str, value: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a nested mapping as one dict: `{"a": {"b": 1}}` becomes `{"a.b": 1}`.
+def _table_of(source: str, rows: Rows, wanted: str) -> Table:
+    """Return a table of rows; raise UnreadableError, which says what was `wanted`, without rows.
 
-    An empty mapping within it is left out. If two keys become equal, the later one counts.
-
-    prefix : text that is put before each key. value : the mapping.
+    A cell is None if its row lacks the column. `source` is the name of the file.
     """
-    items: dict[str, Any] = {}
-    for name, item in value.items():
-        is_nested = isinstance(item, Mapping)
-        items |= flat(f"{prefix}{name}.", item) if is_nested else {f"{prefix}{name}": item}
-    return items
+    if not rows:
+        raise UnreadableError(f"Expected {wanted}, got none")
+    lines, cells = zip(*rows, strict=True)
+    names = dict.fromkeys(chain(*cells))
+    columns = {name: as_cells([row.get(name) for row in cells]) for name in names}
+    return Table(source, columns, np.array(lines))
 
 
 def columns_of(prefix: str, value: Any) -> Columns:
@@ -83,30 +77,33 @@ def columns_of(prefix: str, value: Any) -> Columns:
     """
     if isinstance(value, np.ndarray) and value.dtype == object:
         value = value.tolist()
-    items = value if isinstance(value, list | np.ndarray) else [value]
-    is_object = isinstance(value, Mapping)
-    with instead(UnreadableError, f"Expected items of one form in {prefix}", *DAMAGES):
-        nested = value if is_object else _turned(items)
-    columns: Columns = {} if nested or is_object else {prefix: as_cells(items)}
+    message = f"Expected items of one form in {prefix}"
+    with instead(UnreadableError, message, LookupError, TypeError, ValueError):
+        nested = _turned(value)
+    if nested is None:
+        return {prefix: as_cells(value if isinstance(value, ITEMS) else [value])}
+    columns: Columns = {}
     for name, item in nested.items():
         columns |= columns_of(f"{prefix}.{name}" if prefix else str(name), item)
     return columns
 
 
-def _turned(items: Any) -> Mapping[Any, Any]:
+def _turned(value: Any) -> Mapping[Any, Any] | None:
     """Return a list of mappings as a list for each key, or a list of lists as one for each channel.
 
-    The shorter axis of a list of lists is the channels, which are numbered from 0. The result is
-    empty if the first item is neither, or there is none. Keys that the first mapping lacks are left
-    out. Raises LookupError, TypeError or ValueError if an item lacks a key of the first, is of
-    another kind or has another length.
+    The shorter axis of a list of lists is the channels, which are numbered from 0. A mapping is
+    returned as it is, and None for any other value, also an empty list. Keys that the first mapping
+    of a list lacks are left out. Raises LookupError, TypeError or ValueError if an item lacks a key
+    of the first, is of another kind or has another length.
     """
-    first = items[0] if len(items) else None
+    if isinstance(value, Mapping):
+        return value
+    first = value[0] if isinstance(value, ITEMS) and len(value) else None
     if isinstance(first, Mapping):
-        return {key: [item[key] for item in items] for key in first}
-    if not isinstance(first, list | np.ndarray):
-        return {}
-    x = np.array(items, dtype=object)
+        return {key: [item[key] for item in value] for key in first}
+    if not isinstance(first, ITEMS):
+        return None
+    x = np.array(value, dtype=object)
     return dict(enumerate(x if len(x) <= x.shape[1] else x.swapaxes(0, 1)))
 
 
@@ -129,9 +126,9 @@ def read_frame(frame: Any, source: str) -> Table:
     `source` is the table's name in errors. Rows are numbered from 1. Raises ValueError if the index
     is named like a column.
     """
-    frame = frame.reset_index() if frame.index.name is not None else frame
+    frame = frame.reset_index(drop=frame.index.name is None)
     columns = {str(name): frame[name].to_numpy() for name in frame.columns}
-    return Table(source, columns, range(1, len(frame) + 1))
+    return Table(source, columns, np.arange(1, len(frame) + 1))
 
 
 def read_parquet(content: bytes, source: str) -> Table:
@@ -159,10 +156,9 @@ def read_npz(content: bytes, source: str, has_all: bool) -> Table:
     arrays, _ = read_archive(content, name=source)
     if not arrays:
         raise UnreadableError("Expected arrays, got none")
+    columns = {k: np.atleast_1d(x if has_all else np.squeeze(x)) for k, x in arrays.items()}
     if not has_all:
-        squeezed = {name: np.atleast_1d(np.squeeze(x)) for name, x in arrays.items()}
-        return Table(source, columns_of("", squeezed), [])
-    columns = {name: np.atleast_1d(x) for name, x in arrays.items()}
+        return Table(source, columns_of("", columns), [])
     n = len(max(columns.values(), key=np.size))
     return Table(source, columns, range(1, n + 1))
 
@@ -171,26 +167,21 @@ def read_ts(content: bytes, source: str, form: TextForm) -> Table:
     """Return the table of a `.ts` file of the UCR archive, with a row for each series.
 
     Channels are the columns `0`, `1`, ..., whose cells are lists of texts; the class is the column
-    `class`. A series with fewer channels than others has a list of one empty text for each that is
-    missing. `content` has the bytes of the file, `source` is its name in errors, and of `form` the
-    encoding is used. Raises UnreadableError if the file is not in this encoding, or has no series
-    below a line `@data`, and LookupError for an encoding that Python does not know.
+    `class`. A series with fewer channels than others has None for each that is missing. `content`
+    has the bytes of the file, `source` is its name in errors, and of `form` the encoding is used.
+    Raises UnreadableError if the file is not in this encoding, or has no series below a line
+    `@data`, and LookupError for an encoding that Python does not know.
 
     References
     ----------
     Middlehurst et al. (2024), aeon: a Python toolkit for learning from time series, JMLR 25(289).
     """
-    lines = to_utf8(content, form.encoding).decode().split("\n")
-    heads = [line.strip().lower() for line in lines]
-    first = heads.index("@data") + 1 if "@data" in heads else len(lines)
-    below = enumerate(lines[first:], first + 1)
-    rows = {i: line.strip().rpartition(":") for i, line in below if line.strip()}
-    if not rows:
-        raise UnreadableError("Expected series below a line @data, got none")
-    series = (channels.split(":") for channels, _, _ in rows.values())
-    columns = {
-        str(c): as_cells([cell.split(",") for cell in cells])
-        for c, cells in enumerate(zip_longest(*series, fillvalue=""))
-    }
-    columns["class"] = as_cells([label for _, _, label in rows.values()])
-    return Table(source, columns, [*rows])
+    text = to_utf8(content, form.encoding).decode()
+    head, *below = re.split(r"(?im)^[ \t]*@data[ \t]*$", text, maxsplit=1)
+    rows: Rows = []
+    for number, line in enumerate("".join(below).split("\n"), head.count("\n") + 1):
+        if line.strip():
+            *series, label = line.strip().split(":")
+            channels = {str(c): cells.split(",") for c, cells in enumerate(series)}
+            rows.append((number, {**channels, "class": label}))
+    return _table_of(source, rows, "series below a line @data")

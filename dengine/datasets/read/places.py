@@ -4,10 +4,10 @@ header, or in a listing, which is a file with a row for each recording or part.
 
 import re
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 from ...errors import DataError, instead, listed, shortened
 from ..dataset import Fault
@@ -139,7 +139,7 @@ class LabelReader:
     """
 
     source: LabelSource
-    listing: defaultdict[str, list[str]] = field(default_factory=lambda: defaultdict(list))
+    listing: Mapping[str, Sequence[str]]
     used: set[str] = field(default_factory=set)
 
     def words(self, table: Table, part: str) -> Sequence[str]:
@@ -163,14 +163,13 @@ class LabelReader:
         path = table.path
         if not source.listing:
             return words_of(source, table, [source.column or source.topic], source.at)
-        name = PurePosixPath(path).name
+        name = path.rpartition("/")[2]
         names = filter(None, (part, path, name, without_suffix(path), without_suffix(name)))
         keys = [key for key in map(as_key, names) if key in self.listing]
         if not keys:
-            others = f"it has {listed(sorted(self.listing)[:2])}"
             raise UnreadableError(
-                f"Expected {part or name} in {source.listing}, it is not listed; {others}; if its "
-                "name contains the key, state part.path"
+                f"Expected {part or name} in {source.listing}, it is not listed; it has "
+                f"{listed(sorted(self.listing)[:2])}; if its name contains the key, state part.path"
             )
         self.used.add(keys[0])
         return self.listing[keys[0]]
@@ -180,39 +179,24 @@ class LabelReader:
 
         `table` is the table of the recording, and `part` its part number. If the source is a
         listing, the key that was found in it is added to `used`, the set of keys found so far.
-        Raises UnreadableError if there is no label, if rows of the listing contradict each other,
-        or if a word has no stated meaning, and DataError if `source.path` is no regular expression
-        with one group.
-        """
-        source = self.source
-        words = self.words(table, part)
-        line = 0 if source.listing or source.path else table.line(0)
-        labels = {self.meaning(word, line) for word in words}
-        if len(labels) > 1:
-            raise UnreadableError(
-                f"Expected one label for {part or table.path}, got {listed(sorted(words))}",
-                line,
-                source.column,
-            )
-        return labels.pop()
-
-    def meaning(self, word: str, line: int = 0) -> int | None:
-        """Return what a word of the source means: 1 good, 0 bad, None not checked.
-
-        A word that is stated as several of these has the first of these meanings: good, then bad.
-        Words are compared exactly. Raises UnreadableError for a word whose meaning is not stated;
-        `line` is its line in the file.
+        Words are compared exactly; a word that is stated as several of these has the first of these
+        meanings. Raises UnreadableError if there is no label, if rows of the listing contradict
+        each other, or if a word has no stated meaning, and DataError if `source.path` is no regular
+        expression with one group.
         """
         source = self.source
         meanings: dict[str, int | None] = dict.fromkeys(source.unchecked)
         meanings |= dict.fromkeys(source.bad, 0) | dict.fromkeys(source.good, 1)
-        if word not in meanings:
-            raise UnreadableError(
-                f"Expected a label among {listed(meanings)}, got {shortened(word)}",
-                line,
-                source.column,
-            )
-        return meanings[word]
+        words = self.words(table, part)
+        fault = ""
+        if unknown := [word for word in words if word not in meanings]:
+            fault = f"Expected a label among {listed(meanings)}, got {shortened(unknown[0])}"
+        elif len({meanings[word] for word in words}) > 1:
+            fault = f"Expected one label for {part or table.path}, got {listed(sorted(words))}"
+        if fault:
+            line = 0 if source.listing or source.path else table.line(0)
+            raise UnreadableError(fault, line, source.column)
+        return meanings[words[0]]
 
     def unused_note(self) -> str:
         """Return a sentence on the keys of the listing in which no recording was found, or "".
@@ -220,8 +204,12 @@ class LabelReader:
         It names up to eight of them, with the number of all.
         """
         unused = sorted(self.listing.keys() - self.used, key=natural_key)
-        n = f"{len(unused)} of {len(self.listing)} rows of {self.source.listing}"
-        return f"{n} name no recording that was read: {listed(unused)}." if unused else ""
+        if not unused:
+            return ""
+        return (
+            f"{len(unused)} of {len(self.listing)} rows of {self.source.listing} name no recording "
+            f"that was read: {listed(unused)}."
+        )
 
 
 def as_key(word: str) -> str:
@@ -243,7 +231,7 @@ def read_labels(base: Path, source: LabelSource, form: TextForm) -> LabelReader:
     and there, and LookupError for an encoding that Python does not know. A path that is no valid
     expression is not noticed here.
     """
-    reader = LabelReader(source)
+    listing = defaultdict[str, list[str]](list)
     if source.listing:
         columns = (source.key, source.column)
         if not all(columns):
@@ -251,5 +239,5 @@ def read_labels(base: Path, source: LabelSource, form: TextForm) -> LabelReader:
         with in_listing(source.listing):
             table = listing_table(base / source.listing, form)
             for key, word in zip(*map(table.words, columns), strict=True):
-                reader.listing[as_key(key)].append(word)
-    return reader
+                listing[as_key(key)].append(word)
+    return LabelReader(source, listing)

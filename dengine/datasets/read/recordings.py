@@ -5,23 +5,21 @@ a `Dataset`. What does not follow the description becomes a `Fault`.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import suppress
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from ...errors import DataError, instead, listed
-from ...records import FITS, Floats
+from ...records import FITS, Floats, TraceArray
 from ...traces import can_fit_length, fit_length
-from ..checks import check_description, lost_note, without_repeats
+from ..checks import check_description, without_repeats
 from ..dataset import Dataset, Fault, make_dataset, unit_text
 from ..description import ANY, ORDERS, Channel, Description, RowWords, TextForm
 from ..table import Cells, Recording, Table, UnreadableError
-from ..units import conversion, unit_in
+from ..units import bare, conversion, unit_in
 from .bags import read_bag
 from .clock import check_steps, times_of
 from .files import caught, find_files, natural_key, read_file
@@ -61,34 +59,38 @@ def recording_of(
     """
     clock = description.time
     form = description.text
+    order = description.order
     table, is_lost = kept_rows(table.whole(), description.rows)
     seconds = None
-    start = np.nan
+    rank: Any = ""
     if clock.column:
-        if clock.sort:
-            order = np.argsort(times_of(table, clock, form)[0], kind="stable")
-            table = table.take(order)
-            is_lost = is_lost[order]
         seconds, start = times_of(table, clock, form)
+        if clock.sort:
+            rows = np.argsort(seconds, kind="stable")
+            table = table.take(rows)
+            is_lost = is_lost[rows]
+            seconds, start = times_of(table, clock, form)
         check_steps(seconds, clock, table)
-    rows = [samples_of(table, *item, form) for item in description.channels.items()]
-    lengths = [*map(len, rows if seconds is None else [*rows, seconds])]
+        rank = start if order == "time" else rank
+    samples = [samples_of(table, *item, form) for item in description.channels.items()]
+    lengths = [*map(len, samples if seconds is None else [*samples, seconds])]
     if len({*lengths}) > 1:
         raise UnreadableError(f"Expected channels and times of one length, got {lengths}")
-    samples = np.stack(rows)
     if description.rows:
-        samples[:, is_lost] = np.nan
+        for values in samples:
+            values[is_lost] = np.nan
     part = part_of(description.part, table)
-    if description.windows.trigger or description.windows.listing:
-        part = part or table.path
+    if not part and description.is_cut:
+        part = table.path
     label = label_of(labels, table, part)
     if label is None:
         return None
-    rank = without_label(description.label, table.path) if description.order == "path" else ""
-    if description.order not in ORDERS:
-        rank = table.one_word(description.order, "first")
-    trace = fitted(samples, seconds, description)
-    return Recording(table.source, trace, label, part, lengths[0], start, rank)
+    if order == "path":
+        rank = natural_key(without_label(description.label, table.path))
+    elif order not in ORDERS:
+        rank = natural_key(table.one_word(order, "first"))
+    trace = fitted(np.stack(samples), seconds, description)
+    return Recording(table.source, trace, label, part, lengths[0], rank)
 
 
 @instead(UnreadableError, "Expected columns of one length", IndexError, ValueError)
@@ -105,8 +107,7 @@ def kept_rows(table: Table, rows: Mapping[str, RowWords]) -> tuple[Table, Cells]
     n = max(map(len, table.columns.values()), default=0)
     is_lost: Cells = np.zeros(n, dtype=bool)
     for column, about in rows.items():
-        kinds = {"keep": about.keep, "drop": about.drop, "invalid": about.invalid}
-        kind_of = {word: kind for kind, words in kinds.items() for word in words}
+        kind_of = {word: kind for kind, words in asdict(about).items() for word in words}
         other = kind_of.get(ANY, "")
         words = table.words(column).tolist()
         kind = np.array([kind_of.get(word, other) for word in words], dtype=object)
@@ -127,16 +128,16 @@ def samples_of(table: Table, column: str, channel: Channel, form: TextForm) -> F
     unit of another quantity in the name is ignored.
     """
     values = table.numbers(column, form)
-    factor = 1.0
-    with suppress(DataError):  # a name may have another quantity, as `U [V]` of a force
-        factor = conversion(unit_in(column.rstrip(ANY)), channel.unit)
-    try:
-        if unit := table.units.get(column):
-            factor = conversion(unit, channel.unit)
-    except DataError as error:
-        line = form.units + table.header * isinstance(form.header, str)
-        raise UnreadableError(str(error), line, column) from error
-    return values * (factor * channel.factor)
+    unit = table.units.get(column)
+    factor = conversion(unit or unit_in(column.rstrip(ANY)), channel.unit)
+    if factor is None and unit:
+        raise UnreadableError(
+            f"Expected the unit {channel.unit}, or one that converts to it, got {bare(unit)}",
+            form.units + table.header * isinstance(form.header, str),
+            column,
+        )
+    # A name may have another quantity, as `U [V]` of a force.
+    return values * ((factor or 1.0) * channel.factor)
 
 
 def label_of(labels: Sequence[LabelReader], table: Table, part: str) -> int | None:
@@ -179,8 +180,8 @@ def read_recordings(
         the files. A recording that does not follow the description or repeats another is one of its
         `faults`, and so is a file that cannot be read; of recordings with equal samples and
         different labels none is kept. One whose part was not checked counts in `unlabelled`.
-        `notes` says if samples are lost, rows of a listing name no recording, or there are fewer
-        recordings than when the description was made.
+        `notes` says if rows of a listing name no recording, or there are fewer recordings than when
+        the description was made.
 
     Raises
     ------
@@ -197,17 +198,16 @@ def read_recordings(
     labels = [read_labels(base, label, description.text) for label in description.labels]
     recordings: list[Recording] = []
     n_unlabelled = 0
-    for file, title in files:
-        with caught(faults, title):
-            for part in parts_of(file, title, description, base):
+    for file in files:
+        with caught(faults, file.source if isinstance(file, Table) else file):
+            for part in parts_of(file, description, base):
                 with caught(faults, part.source):
                     recording = recording_of(part, description, labels)
                     recordings += [recording] if recording else []
                     n_unlabelled += recording is None
         if progress is not None:
             progress(1)
-    is_timed = description.order == "time"
-    recordings.sort(key=lambda item: (item.start if is_timed else 0, natural_key(item.rank)))
+    recordings.sort(key=lambda item: item.rank)
     recordings, repeats = without_repeats(recordings)
     faults += repeats
     if not recordings:
@@ -216,21 +216,24 @@ def read_recordings(
             f"Expected recordings in {name}, none is left: {len(faults)} have faults, "
             f"{n_unlabelled} no label.{why}"
         )
-    data = dataset_of(recordings, description)
-    n_found = len(data) + len(faults) + n_unlabelled
+    n_found = len(recordings) + len(faults) + n_unlabelled
     n_seen = description.seen.recordings
     notes = [label.unused_note() for label in labels]
     if n_found < n_seen:
         notes.append(f"The description was made for {n_seen} recordings, now there are {n_found}.")
-    notes.append(lost_note(recordings))
-    kept_notes = tuple(filter(None, notes))
-    return replace(data, name=name, faults=tuple(faults), notes=kept_notes, unlabelled=n_unlabelled)
+    return replace(
+        dataset_of(recordings, description),
+        name=name,
+        faults=tuple(faults),
+        notes=tuple(filter(None, notes)),
+        unlabelled=n_unlabelled,
+    )
 
 
 def files_of(
     source: Any, description: Description, faults: list[Fault]
-) -> tuple[str, Path, Sequence[tuple[Path | Table, str]]]:
-    """Return the name of a data set, its folder, and a list of (file or table, name) to read.
+) -> tuple[str, Path, Sequence[str | Table]]:
+    """Return the name of a data set, its folder, and what to read: files in it, or a table.
 
     The data set has the name of the folder, or of the file without its suffix. All files of a bag
     are read here, into one table; a fault of each damaged one is appended to `faults`. A DataFrame
@@ -239,33 +242,30 @@ def files_of(
     `windows.trigger` of a bag is malformed.
     """
     if not isinstance(source, Path):
-        return FRAME, Path(), [(read_frame(source, FRAME), FRAME)]
+        return FRAME, Path(), [read_frame(source, FRAME)]
     is_folder = source.is_dir()
     name = source.resolve().name if is_folder else source.stem
-    files: Any = find_files(source, description)
-    if description.layout == "mcap":
-        title = files[0][1] if len(files) == 1 else name
-        files = [(read_bag(files, title, description, faults), title)]
-    return name, source if is_folder else source.parent, files
+    base = source if is_folder else source.parent
+    files = find_files(source, description)
+    if description.layout != "mcap":
+        return name, base, files
+    title = files[0] if len(files) == 1 else name
+    return name, base, [read_bag(base, files, title, description, faults)]
 
 
-def parts_of(
-    file: Path | Table, name: str, description: Description, base: Path
-) -> Iterator[Table]:
+def parts_of(file: str | Table, description: Description, base: Path) -> Iterator[Table]:
     """Yield the tables of the parts in a file, or in a table that was read already.
 
     Each table that `split` yields is one part, or, if `[windows]` is stated, a long recording that
-    is cut into parts. `name` is the file's name in errors, and `base` the folder of the listing in
-    `[windows]`. Raises UnreadableError or DataError if the file cannot be read, DataError if it
-    cannot be split, or one of its recordings cannot be cut (those before it are yielded), and
-    SettingError if `windows.trigger` is malformed.
+    is cut into parts. `base` is the folder of the file, and of the listing in `[windows]`. Raises
+    UnreadableError or DataError if the file cannot be read, DataError if it cannot be split, or one
+    of its recordings cannot be cut (those before it are yielded), and SettingError if
+    `windows.trigger` is malformed.
     """
-    table = file if isinstance(file, Table) else table_of(read_file(file), name, description)
-    for part in split(table, description):
-        if description.windows.trigger or description.windows.listing:
-            yield from cut(part, description, base)
-        else:
-            yield part
+    if not isinstance(file, Table):
+        file = table_of(read_file(base / file), file, description)
+    for part in split(file, description):
+        yield from cut(part, description, base) if description.is_cut else [part]
 
 
 def dataset_of(recordings: Sequence[Recording], description: Description) -> Dataset:
@@ -277,16 +277,16 @@ def dataset_of(recordings: Sequence[Recording], description: Description) -> Dat
     "pad-all". `limit` is that of the first channel. `part` is None if no recording has a part
     number. Raises DataError if `make_dataset` refuses the traces.
     """
-    labels, parts, sources, lengths = (
+    X, labels, parts, sources, lengths = (
         np.array([getattr(recording, key) for recording in recordings])
-        for key in ("label", "part", "source", "length")
+        for key in ("trace", "label", "part", "source", "length")
     )
     channels = [*description.channels.values()]
     clock = description.time
     fit = description.traces.lengths.removesuffix("-all")
     is_grid = fit == "resample" and clock.column and clock.rate_hz
     return make_dataset(
-        np.stack([recording.trace for recording in recordings]),
+        X,
         labels,
         rate_hz=clock.rate_hz or None,
         unit=unit_text([channel.unit for channel in channels]),
@@ -300,9 +300,7 @@ def dataset_of(recordings: Sequence[Recording], description: Description) -> Dat
     )
 
 
-def fitted(
-    samples: Floats, seconds: Floats | None, description: Description
-) -> NDArray[np.float32]:
+def fitted(samples: Floats, seconds: Floats | None, description: Description) -> TraceArray:
     """Return the trace (C, T) of samples (C, n), brought to T samples as `[traces]` says.
 
     `seconds`, shape (n,), has the times since the first sample; None without a clock. With
@@ -323,17 +321,15 @@ def fitted(
     n = samples.shape[1]
     kind = FITS.index(about.lengths.removesuffix("-all"))
     can_fit = can_fit_length(n, about.samples, kind) or (about.lengths == "pad-all" and n > 0)
-    times = None
     if about.lengths == "resample" and seconds is not None:
         times = np.linspace(0, seconds[-1], about.samples)
         if rate:
             times = np.arange(about.samples) / rate
             can_fit = bool(times[-1] <= seconds[-1] + (1 + ROUNDING) / rate)
-    if not can_fit:
-        raise UnreadableError(
-            f"Expected {about.samples} samples, got {n}; see traces.lengths, which is "
-            f"{about.lengths}"
-        )
-    if times is not None and seconds is not None:
-        return np.stack([np.interp(times, seconds, row) for row in samples]).astype(np.float32)
-    return fit_length(torch.from_numpy(samples.astype(np.float32)), about.samples, kind).numpy()
+        if can_fit:
+            return np.stack([np.interp(times, seconds, row) for row in samples]).astype(np.float32)
+    elif can_fit:
+        return fit_length(torch.from_numpy(samples.astype(np.float32)), about.samples, kind).numpy()
+    raise UnreadableError(
+        f"Expected {about.samples} samples, got {n}; see traces.lengths, which is {about.lengths}"
+    )

@@ -1,7 +1,7 @@
 """Split what a file holds into one table for each part, by its layout."""
 
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from itertools import chain
 
@@ -27,7 +27,8 @@ def table_of(content: bytes, name: str, description: Description) -> Table:
     the file does not have this format, and DataError without pyarrow for a Parquet file; for a text
     file also SettingError if `windows.trigger` is malformed.
     """
-    kind, form = description.format, description.text
+    kind = description.format
+    form = description.text
     if kind == "ts":
         return frames.read_ts(content, name, form)
     if kind in OBJECTS:
@@ -47,12 +48,13 @@ def column_kind(description: Description) -> Kind:
     description does not name so is not needed. Raises SettingError if `windows.trigger` is
     malformed.
     """
-    clock = zip(description.time.column, description.time.format, strict=False)
-    dated = {name for name, form in clock if is_dated(form)}
+    clock = description.time
+    forms = zip(clock.column, clock.format, strict=False)
+    dated = {name for name, form in forms if is_dated(form)}
     order = {description.order} - ORDERS
     words = dated.union(description.part.column, description.rows, order)
     words |= {source.column for source in description.labels}
-    numbers = {*description.time.column, *signals_of(description)}
+    numbers = {*clock.column, *signals_of(description)}
     patterns = [*map(pattern_of, description.channels)]
 
     def kind_of(name: str) -> str:
@@ -98,14 +100,16 @@ def split(table: Table, description: Description) -> Iterator[Table]:
     without `time.sort`; in `columns` and for a whole file, if the file has any. Raises DataError if
     `part.column` of the layout `long` is not stated or not in the table.
     """
-    if description.layout == "long":
+    table = replace(table, path=table.source)
+    layout = description.layout
+    if layout == "long":
         yield from _split_rows(table, description)
-    elif description.layout == "columns":
+    elif layout == "columns":
         yield from _split_columns(table, description)
-    elif description.layout in ("wide", "npz") or description.format in OBJECTS:
+    elif layout in ("wide", "npz") or description.format in OBJECTS:
         yield from _split_wide(table, description)
     else:
-        yield replace(table, path=table.source)
+        yield table
 
 
 def _split_rows(table: Table, description: Description) -> Iterator[Table]:
@@ -121,23 +125,19 @@ def _split_rows(table: Table, description: Description) -> Iterator[Table]:
     columns = description.part.column
     if not columns:
         raise DataError("Expected part.column, the column that tells the parts apart.")
-    errors = {error.line: error for error in table.damage}
-    damaged = np.searchsorted(table.lines, [*errors]).tolist() if errors else []
+    damaged = np.searchsorted(table.lines, [error.line for error in table.damage])
     kept = np.delete(np.arange(len(table.lines)), damaged)
     keys = [table.words(column)[kept] for column in columns]
     for key, group in pd.Series(kept).groupby(keys, sort=False):
         rows = group.to_numpy()
-        first = int(rows[0])
-        last = int(rows[-1])
-        damage = [errors[table.line(i)] for i in damaged if first - 1 <= i <= last + 1]
-        is_whole = last - first < len(rows)
-        if not (damage or is_whole or description.time.sort):
-            line = table.line(int(rows[np.argmax(np.diff(rows) > 1) + 1]))
+        is_beside = (damaged >= rows[0] - 1) & (damaged <= rows[-1] + 1)
+        damage = [table.damage[i] for i in np.flatnonzero(is_beside)]
+        breaks = rows[1:][np.diff(rows) > 1]
+        if len(breaks) and not description.time.sort:
             message = "Expected the rows of a part together, others stand between them"
-            damage = [UnreadableError(message, line, columns[0])]
-        part = table.take(slice(first, last + 1) if is_whole else rows)
+            damage.append(UnreadableError(message, table.line(breaks[0]), columns[0]))
         source = f"{table.source}, {' '.join(key)}"
-        yield replace(part, source=source, path=table.source, damage=damage)
+        yield replace(table.take(rows), source=source, damage=damage)
 
 
 def _split_wide(table: Table, description: Description) -> Iterator[Table]:
@@ -149,19 +149,22 @@ def _split_wide(table: Table, description: Description) -> Iterator[Table]:
     empty one in none. A part has damage if its row had a wrong number of cells, or if the items of
     a list in it are not all alike; then it has only its numbered channels.
     """
-    groups = {
-        key: [match[0] for match in match_numbered(key, table.columns)]
-        for key in description.channels
-        if ANY in key
-    }
-    groups = {key: names for key, names in groups.items() if names}
-    curves = {key: np.stack([*map(table.column, names)], axis=1) for key, names in groups.items()}
+    groups: dict[str, list[str]] = {}
+    curves: frames.Columns = {}
+    units = {**table.units}
+    for key in description.channels:
+        names = [match[0] for match in match_numbered(key, table.columns)]
+        if ANY in key and names:
+            groups[key] = names
+            curves[key] = np.stack([*map(table.column, names)], axis=1)
+            units[key] = units.get(names[0], "")
     used = {*chain(*groups.values())}
     others = {name: c for name, c in table.columns.items() if len(c) and name not in used}
-    rest = replace(table, columns=others)
+    rest = replace(table, columns=others, units=units, origin=groups)
     for i in range(len(table.lines)):
-        samples = {key: rows[i] for key, rows in curves.items()}
-        yield _with_samples(_row_of(rest, i), samples, groups)
+        part = _row_of(rest, i)
+        samples = {key: without_empty_end(rows[i]) for key, rows in curves.items()}
+        yield replace(part, columns={**part.columns, **samples})
 
 
 def _row_of(table: Table, i: int) -> Table:
@@ -175,12 +178,13 @@ def _row_of(table: Table, i: int) -> Table:
     line = table.lines[i]
     source = f"{table.source}, row {line or i + 1}" if n > 1 else table.source
     damage = [error for error in table.damage if error.line == line]
-    part = replace(table, source=source, path=table.source, lines=[line], damage=damage)
     row = {name: cells[i] if len(cells) == n else cells for name, cells in table.columns.items()}
+    columns: frames.Columns = {}
     try:
-        return replace(part, columns=frames.columns_of("", row))
+        columns = frames.columns_of("", row)
     except UnreadableError as error:
-        return replace(part, columns={}, damage=[error])
+        damage = [error]
+    return replace(table, source=source, columns=columns, lines=[line], damage=damage)
 
 
 def match_numbered(key: str, columns: Iterable[str]) -> list[re.Match[str]]:
@@ -205,26 +209,16 @@ def _split_columns(table: Table, description: Description) -> Iterator[Table]:
     beside = {key: cells for key, cells in table.columns.items() if key in shared}
     for column in filter(pattern_of(channel).fullmatch, table.columns):
         if column not in shared:
-            samples = {channel: table.columns[column]}
-            origin = {channel: [column] * len(table.lines)}
-            part = _with_samples(replace(table, columns=beside, path=column), samples, origin)
-            part = part.take(slice(0, len(part.columns[channel])))
-            yield replace(part, source=f"{table.source}, column {column}")
-
-
-def _with_samples(
-    table: Table, samples: frames.Columns, origin: Mapping[str, Sequence[str]]
-) -> Table:
-    """Return a table to which columns with the samples of channels are added.
-
-    Cells at the end of a channel that are empty or NaN are left out. The unit of a channel becomes
-    that of its first column in the file, "" if that has none. `origin` replaces that of the table.
-
-    samples : the cells by channel. origin : by channel the column of the file for each sample.
-    """
-    units = {key: table.units.get(names[0], "") for key, names in origin.items() if names}
-    columns = {**table.columns, **{key: without_empty_end(cells) for key, cells in samples.items()}}
-    return replace(table, columns=columns, units={**table.units, **units}, origin=origin)
+            samples = without_empty_end(table.columns[column])
+            part = replace(
+                table,
+                source=f"{table.source}, column {column}",
+                path=column,
+                columns={**beside, channel: samples},
+                units={channel: table.units.get(column, "")},
+                origin={channel: [column] * len(samples)},
+            )
+            yield part.take(slice(0, len(samples)))
 
 
 def without_empty_end(cells: Cells) -> Cells:

@@ -9,19 +9,20 @@ import csv
 import io
 import re
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
 
 from ..description import TextForm
-from ..table import Cells, Table, UnreadableError
+from ..table import Table, UnreadableError
 
 COMMENT = re.compile(r"^[#%]+\s*")
 BLANK = " "
 REST = "*"  # at the end of the last name: it stands for all columns that remain
-NUMBER, WORD = "number", "word"  # kinds of columns
+NUMBER = "number"  # kinds of columns
+WORD = "word"
 Kind = Callable[[str], str]
 
 
@@ -57,8 +58,10 @@ def read_text(content: bytes, source: str, form: TextForm, kind_of: Kind = lambd
         If Python does not know the encoding.
     """
     content = to_utf8(content, form.encoding)
-    header = _header_line(content, form.header)
-    above = header if isinstance(form.header, str) else 0
+    header = form.header
+    above = 0
+    if isinstance(header, str):
+        header = above = _header_line(content, header)
     first = form.data + above
     units = form.units and form.units + above
     end = content.rstrip(b"\n").count(b"\n") + 2
@@ -70,12 +73,9 @@ def read_text(content: bytes, source: str, form: TextForm, kind_of: Kind = lambd
     cells = split_line("".join(top[units - 1 : units]), form.delimiter)
     stated = dict(zip(names, map(str.strip, cells), strict=False))
     columns = dict.fromkeys(names, np.empty(0))
-    table = Table(source, columns, range(first, end), stated, top[: (header or first) - 1], header)
-    kinds = {name: kind_of(name) for name in names}
-    plain = {} if form.drop else _read_plain(content, table, form, kinds)
-    if plain:
-        return replace(table, columns={**columns, **plain})
-    return _read_strictly(content, table, form)
+    lines = np.arange(first, end)
+    table = Table(source, columns, lines, stated, top[: (header or first) - 1], header)
+    return _read_plain(content, table, form, kind_of) or _read_strictly(content, table, form)
 
 
 def to_utf8(content: bytes, encoding: str) -> bytes:
@@ -121,16 +121,11 @@ def header_names(cells: Sequence[str]) -> list[str]:
     return [f"{name}.{n}" if n > 1 else name for name, n in zip(names, places, strict=True)]
 
 
-def _header_line(content: bytes, header: int | str) -> int:
-    """Return the number of the header's line, from 1; 0 for none.
+def _header_line(content: bytes, header: str) -> int:
+    """Return the number of the first line, from 1, that begins with a text, `header`.
 
-    The first line that begins with the text counts; a number is returned as it is. Raises
-    UnreadableError if `header` is a text and no line begins with it.
-
-    content : the file in UTF-8. header : the number, or the text with which the line begins.
+    `content` is the file in UTF-8. Raises UnreadableError if no line begins with the text.
     """
-    if isinstance(header, int):
-        return header
     for i, line in enumerate(io.BytesIO(content), 1):
         if line.startswith(header.encode(errors="replace")):
             return i
@@ -150,7 +145,7 @@ def _names(top: Sequence[str], header: int, form: TextForm) -> list[str]:
     """
     names = [*form.names]
     if names and names[-1].endswith(REST):
-        rest = names.pop()[: -len(REST)]
+        rest = names.pop().removesuffix(REST)
         n = len(split_line(top[-1], form.delimiter)) - len(names)
         names += [f"{rest}{i}" for i in range(n)]
     elif not names:
@@ -161,19 +156,22 @@ def _names(top: Sequence[str], header: int, form: TextForm) -> list[str]:
     return names
 
 
-def _read_plain(
-    content: bytes, table: Table, form: TextForm, kinds: Mapping[str, str]
-) -> dict[str, Cells]:
-    """Return the needed columns by name, read by pandas; none if anything in the file is not plain.
+def _read_plain(content: bytes, table: Table, form: TextForm, kind_of: Kind) -> Table | None:
+    """Return the table with its needed columns, read by pandas; None if the file is not plain.
 
     Not plain are a row with a wrong number of cells, an empty line, an empty last cell, a cell with
-    a line break, and one that is not a finite number in a column of numbers, like an empty one.
+    a line break, and one that is not a finite number in a column of numbers, like an empty one; nor
+    is a file of which `form.drop` leaves out lines.
 
-    table : only the names of its columns and the lines of its rows are used. kinds : the kind of
-    each column: "number", "word" (its cells are read as texts), or "" if it is not needed.
+    table : has the names of the columns, which are empty, and the lines of the rows. kind_of :
+    returns the kind of a column: "number", "word" (its cells are read as texts), or "" if it is not
+    needed and stays empty.
     """
     import pandas as pd
 
+    if form.drop:
+        return None
+    kinds = {name: kind_of(name) for name in table.columns}
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", pd.errors.DtypeWarning)
@@ -182,26 +180,26 @@ def _read_plain(
                 sep=r"\s+" if form.delimiter == BLANK else form.delimiter,
                 header=None,
                 skiprows=table.lines[0] - 1,
-                names=[*table.columns],
+                names=[*kinds],
                 decimal=form.decimal,
                 dtype={name: "category" for name, kind in kinds.items() if kind == WORD},
                 keep_default_na=False,
             )
     except (ValueError, OverflowError):  # a row of too many cells, among others
-        return {}
+        return None
     is_whole = len(frame) == len(table.lines) and isinstance(frame.index, pd.RangeIndex)
     if not is_whole or frame.iloc[:, -1].isin(["", np.nan]).any():  # the end of a cut row
-        return {}
-    columns = dict[str, Cells]()
+        return None
+    columns = {**table.columns}
     for name, kind in kinds.items():
         cells = frame[name]
-        if kind == WORD:
+        if kind == WORD:  # equal words are one object
             columns[name] = np.array(cells.array.categories, dtype=object)[cells.array.codes]
         elif kind == NUMBER:
             columns[name] = cells.to_numpy()
             if cells.dtype.kind not in "iuf" or not np.isfinite(columns[name]).all():
-                return {}
-    return columns
+                return None
+    return replace(table, columns=columns)
 
 
 def _read_strictly(content: bytes, table: Table, form: TextForm) -> Table:
@@ -215,7 +213,7 @@ def _read_strictly(content: bytes, table: Table, form: TextForm) -> Table:
     rows = dict[int, list[str]]()
     damage = list[UnreadableError]()
     for i, line in enumerate(content.decode().split("\n"), 1):
-        if i in table.lines and line.strip() and not line.startswith(form.drop):
+        if i >= table.lines[0] and line.strip() and not line.startswith(form.drop):
             rows[i] = split_line(line, form.delimiter)
             if len(rows[i]) != n:
                 message = (

@@ -11,7 +11,7 @@ from ...records import Floats
 from ..description import Clock, Description
 from ..table import Table, UnreadableError
 from ..triggers import StartFinder, as_trigger
-from .clock import column_times, times_of
+from .clock import times_of
 from .frames import as_cells
 from .places import in_listing, listing_table
 from .split import verdicts_of
@@ -44,12 +44,17 @@ def cut(table: Table, description: Description, base: Path) -> Iterator[Table]:
     ends = [*(rows.start for _, rows, _ in windows[1:]), None]
     for (key, rows, fault), end in zip(windows, ends, strict=True):
         part = table.take(rows)
-        columns = {**part.columns}
+        verdicts = {}
         for topic in verdicts_of(description):
             words = table.column(topic)[rows.start : end]
-            columns[topic] = as_cells([word for word in words if word is not None][:1])
-        damage = [UnreadableError(fault)] if fault else []
-        yield replace(part, source=f"{name}, {key}", path=key, columns=columns, damage=damage)
+            verdicts[topic] = as_cells([word for word in words if word is not None][:1])
+        yield replace(
+            part,
+            source=f"{name}, {key}",
+            path=key,
+            columns={**part.columns, **verdicts},
+            damage=[UnreadableError(fault)] if fault else [],
+        )
 
 
 def _triggered(table: Table, times: Floats, description: Description, base: Path) -> Windows:
@@ -91,29 +96,25 @@ def _listed(table: Table, times: Floats, description: Description, base: Path) -
     """
     about = description.windows
     form = description.text
-    clock = Clock(zone=description.time.zone)
     bounds = []
     with in_listing(about.listing):
         listing = listing_table(base / about.listing, form)
         keys = listing.words(about.key)
         for column in (about.start, about.end):
-            relative, first = column_times(listing, column, about.format, clock, form)
-            bounds.append(relative + first)
-    begins, ends = np.array(bounds) - TOLERANCE
-    if ends.max() < EPOCH <= times[0]:
-        begins += times[0]
-        ends += times[0]
-    step = 1.5 / (description.time.rate_hz or np.inf) + TOLERANCE
+            clock = Clock((column,), (about.format,), description.time.zone)
+            seconds, start = times_of(listing, clock, form)
+            bounds.append(seconds + (start - TOLERANCE))
+    zero = times[0] if bounds[1].max() < EPOCH <= times[0] else 0.0
+    begins, ends = np.array(bounds) + zero
+    margin = 1.5 / (description.time.rate_hz or np.inf) + TOLERANCE
     latest = -np.inf
-    for i in np.argsort(begins, kind="stable"):
-        begin = begins[i]
-        end = ends[i]
+    for begin, end, key in sorted(zip(begins, ends, keys.tolist(), strict=True)):
+        rows = np.flatnonzero((times >= begin) & (times < end))
         fault = ""
-        inside = np.flatnonzero((times >= begin) & (times < end))
         if begin < latest - TOLERANCE:
             fault = "Expected windows apart, it overlaps the one before"
-        elif not len(inside) or begin < times[0] - step or end > times[-1] + step:
+        elif not len(rows) or begin < times[0] - margin or end > times[-1] + margin:
             fault = "Expected samples in the whole window, it has none or goes beyond the recording"
         latest = max(latest, end)
-        rows = slice(inside[0], inside[-1] + 1) if len(inside) else slice(0, 1)
-        yield str(keys[i]), rows, fault
+        window = slice(rows[0], rows[-1] + 1) if len(rows) else slice(0, 1)
+        yield key, window, fault
