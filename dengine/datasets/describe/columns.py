@@ -7,6 +7,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
+from statistics import mode
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,7 @@ from ..description import Clock, Description, TextForm
 from ..read.clock import ISO, times_of
 from ..read.split import column_kind
 from ..table import Table
-from ..units import bare
+from ..units import bare, unit_in
 
 DAY = "%Y-%m-%d"
 DAYS = ("%d.%m.%Y", "%Y/%m/%d", "%m/%d/%Y", "%d/%m/%Y", "%d.%m.%y", "%d-%b-%y", "%d-%b-%Y")
@@ -92,9 +93,9 @@ class Column:
 
     @cached_property
     def unit(self) -> str:
-        """The unit that most files state for the column; "" if more state none than any one."""
-        units = Counter(bare(table.units.get(self.name, "")) for table in self.tables)
-        return units.most_common(1)[0][0]
+        """The unit that most files state for the column, or else the one in its name, or ""."""
+        unit = mode(bare(table.units.get(self.name, "")) for table in self.tables)
+        return unit or unit_in(re.sub(r"\.\d+$|\*$", "", self.name))
 
     @cached_property
     def forms(self) -> list[str]:

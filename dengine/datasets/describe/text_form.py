@@ -10,6 +10,7 @@ from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from itertools import product
+from statistics import mode
 from typing import Any
 
 import numpy as np
@@ -112,7 +113,7 @@ def _share_of_numbers(lines: Sequence[str], delimiter: str) -> tuple[float, int]
     first third of the lines, which may be text above the samples, and empty lines are left out.
     """
     rows = [split_line(line, delimiter) for line in lines[len(lines) // 3 :] if line.strip()]
-    width = Counter(map(len, rows)).most_common(1)[0][0] if rows else 0
+    width = mode([*map(len, rows), 0])
     same = [row for row in rows if len(row) == width]
     cells = [cell for row in same for cell in row if cell.strip()]
     if width < 2 or not cells:
@@ -182,32 +183,32 @@ def _head_lines(rows: Rows, width: int, stated: Stated) -> tuple[int, int]:
     return max(heads, default=0), units
 
 
-def propose_form(p: Proposal, contents: Mapping[str, bytes]) -> None:
-    """Set `[text]` in `p` to the text form of most files, and leave out files of another form.
+def propose_form(p: Proposal, contents: Mapping[str, bytes], faults: list[Fault]) -> Sequence[str]:
+    """Set `[text]` in `p` to the text form of most files; return the names of these files.
 
-    Those have another delimiter, number of columns or header, and move from `p.names` to
-    `p.others`. If two or more of them have at least 8 rows of samples, `exclude` is set to `?`,
-    with a note that asks whether they are recordings. A file that is no text, or whose header is
-    not certain, is ignored and stays in `p.names`; if all are such, DataError is raised. Of equally
-    frequent forms the first counts. Stated keys stay.
+    Files with another delimiter, number of columns or header are left out: they move from `p.names`
+    to `p.others`. If two or more of them have at least 8 rows of samples, `exclude` is set to `?`,
+    with a note that asks whether they are recordings. For a file that is no text, or whose header
+    is not certain, a fault is appended to `faults`, and it stays in `p.names`; if all are such,
+    nothing is set and returned. Of equally frequent forms the first counts. Stated keys stay.
 
     contents : the contents of the files that are looked at, by name.
     """
     groups = defaultdict[Any, dict[str, Look]](dict)
-    faults = list[Fault]()
     for name, content in contents.items():
         with caught(faults, name):
             item = look(content, p.stated)
             groups[item.form.delimiter, item.width, item.line][name] = item
-    if not groups:
-        raise DataError(f"Expected a text with numbers, found none: {listed(faults[:1])}.")
-    same = groups.pop(max(groups, key=lambda key: len(groups[key])))
+    same = max(groups.values(), key=len, default={})
     odd = {name: item for group in groups.values() for name, item in group.items()}
+    odd = {name: item for name, item in odd.items() if name not in same}
     p.others = [*p.others, *odd]
     p.names = [name for name in p.names if name not in odd]
     if sum(len(item.rows) >= LEAST_RUN for item in odd.values()) > 1:
         p.put("exclude", UNKNOWN, f"are {listed(odd)} recordings of another form? See files")
-    _propose_keys(p, [*same.values()])
+    if same:
+        _propose_keys(p, [*same.values()])
+    return [*same]
 
 
 def _propose_keys(p: Proposal, looks: Sequence[Look]) -> None:
@@ -244,8 +245,8 @@ def _column_names(usual: Look) -> Sequence[str]:
     it has fewer cells than there are columns, the last ones are named `column3`, `column4`, ...
     Without a header, or if it has more words than there are columns, the names are `c0`, `c1`, ...;
     for 20 columns or more it is `x*`, which names all of them. Such a table may have a part in each
-    row: if its first column has 2 to 12 different words, all whole numbers, and fewer of them than
-    the second, it is named `class`, before `x*`.
+    row: if its first column has 2 to 12 different words, all whole numbers, it is named `class`,
+    before `x*`.
 
     usual : how a typical file is written, and the cells of its samples.
     """
@@ -257,9 +258,9 @@ def _column_names(usual: Look) -> Sequence[str]:
         return names if len(cells) != width else []
     if width < MOST_NAMES:
         return [f"c{i}" for i in range(width)]
-    firsts, seconds = ({row[i].strip() for row in usual.rows if len(row) > i} for i in (0, 1))
-    is_class = 1 < len(firsts) <= min(MOST_CLASSES, len(seconds) - 1)
-    return ["class", "x*"] if is_class and all(map(WHOLE.fullmatch, firsts)) else ["x*"]
+    firsts = {row[0] for row in usual.rows}
+    is_class = 1 < len(firsts) <= MOST_CLASSES and all(map(WHOLE.fullmatch, firsts))
+    return ["class", "x*"] if is_class else ["x*"]
 
 
 def propose_marks(p: Proposal, cells: Collection[str]) -> None:
@@ -275,10 +276,9 @@ def propose_marks(p: Proposal, cells: Collection[str]) -> None:
     cells : the different texts in the samples that are numbers with any of these marks.
     """
     counts = Counter(cell.translate(SAME_DIGITS) for cell in cells)
-    possible = p.description.text.decimal if "text.decimal" in p.stated else ".,"
     n_read = {
         marks: sum(n for cell, n in counts.items() if pattern_of(*marks).fullmatch(cell))
-        for marks in product(possible, GROUPS)
+        for marks in product(p.stated.get("text.decimal", ".,"), GROUPS)
         if marks[0] != marks[1]
     }
     most = max(n_read.values())
