@@ -30,6 +30,8 @@ FORMS = (DAY, ISO, *DAYS, *TIMES, "%M:%S.%f", *ZONED, *MOMENTS)
 LIKE_A_TIME = re.compile(r"\d+[:\-./T](\d+|[A-Za-z]{3})[:\-./T]\d|\d+:\d+\.\d|\d{8}T\d{6}")
 LEAST_RUN = 8  # rows of a part
 MOST_WORDS = 12  # that are told apart, as labels
+STRANGE = 0.01
+LOST = ("nan", "null", "none", "n/a", "na", "-", "--", "---", "#n/a", "")
 MOST_CELLS = 20  # of a recording whose form of times is looked at
 # A number with any decimal mark and any mark of groups.
 NUMBER = re.compile(
@@ -66,6 +68,13 @@ class Column:
     def odd(self) -> Counter[str]:
         """How often each word comes that is not a number with any decimal mark."""
         return Counter({w: n for w, n in self.counts.items() if not NUMBER.fullmatch(w)})
+
+    @property
+    def strange(self) -> Counter[str]:
+        """The texts in more than 1 % of the cells each that do not mean a lost sample (`LOST`)."""
+        least = STRANGE * self.counts.total()
+        odd = self.odd.items()
+        return Counter({w: n for w, n in odd if w.lower() not in LOST and n > least})
 
     @cached_property
     def fixed(self) -> list[str]:
@@ -109,7 +118,7 @@ class Column:
         if self.tables[0].columns[self.name].dtype.kind == "M":
             return [ISO]
         cells = {word for words in self.words for word in (*words[:MOST_CELLS], *words[-1:])}
-        if not cells or not all(map(LIKE_A_TIME.match, cells)):
+        if not all(map(LIKE_A_TIME.match, cells)):
             return []
         table = Table(self.name, {self.name: np.array(sorted(cells), dtype=object)}, [])
         forms = list[str]()

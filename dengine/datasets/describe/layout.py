@@ -143,7 +143,7 @@ def parts_of(p: Proposal, files: Tables) -> list[Table]:
     if layout == "columns":
         clock = [*filter(CLOCK_NAME.search, files[0].columns)]
         description = description.with_values({"time.column": clock})
-    if layout in ("wide", "columns") and not description.channels:
+    if not description.channels:
         description = replace(description, channels=dict.fromkeys(patterns, Channel()))
     parts = list[Table]()
     for table in files:

@@ -3,7 +3,6 @@ nothing.
 """
 
 import re
-from collections import Counter
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import replace
@@ -11,25 +10,23 @@ from dataclasses import replace
 import numpy as np
 
 from ...errors import DataError, listed
-from ..description import ANY, UNKNOWN, Channel, LabelSource, PartSource, RowWords, expect_one_of
+from ..description import ANY, UNKNOWN, LabelSource, PartSource, RowWords, expect_one_of
 from ..read.files import natural_key
 from ..read.recordings import kept_rows
 from ..read.split import match_numbered
 from ..units import quantity_of
 from .clock import NAME as CLOCK_NAME
 from .clock import is_clock, propose_clock, propose_rate
-from .columns import MOST_WORDS, Column, Proposal, columns_of, counts_of
+from .columns import LOST, MOST_WORDS, Column, Proposal, columns_of, counts_of
 from .labels import NAME, has_meaning, lines_of, part_words, propose_label, row_of
 from .layout import PART_NAME
 from .order import propose_order
 
 MOST_FREQUENT = 0.9  # of the rows, if the others are of another signal
 SPARSE = 0.1
-STRANGE = 0.01
 PART_LINE = re.compile(r"(?i)serial|barcode|dmc|part ?(no|num|id)|teilenummer|werkst.ck|serien")
 QUALIFIER_NAME = re.compile(r"(?i)status|valid|quality|flag|error|state")
 COUNTER_NAME = re.compile(r"(?i)(index|row|sample|n|i|punkt|point|count|nr|no|line)s?")
-LOST = ("nan", "null", "none", "n/a", "na", "-", "--", "---", "#n/a", "")
 LOADS = ("force", "torque")
 SET_VALUE = re.compile(r"(?i)(^|[^a-z])(set|soll|max|min|limit)")
 FORCES = (
@@ -103,7 +100,6 @@ def qualify_rows(p: Proposal) -> None:
     SettingError for a malformed `windows.trigger`.
     """
     rows = dict(p.description.rows)
-    unused = p.unused
     for name in rows.keys() & p.columns.keys():
         about = rows[name]
         named = {*about.keep, *about.drop, *about.invalid}
@@ -111,7 +107,7 @@ def qualify_rows(p: Proposal) -> None:
         key = "drop" if about.keep else "keep"
         words = rest if len(rest) <= MOST_WORDS else (ANY,)
         rows[name] = replace(about, **{key: getattr(about, key) + words})
-    for column in filter(qualifies, unused):
+    for column in filter(qualifies, p.unused):
         words = tuple(column.counts)
         if len(words) > 1:
             text = f"which rows are samples? {counts_of(column.counts)}; others drop or invalid"
@@ -180,7 +176,7 @@ def propose_channels(p: Proposal, units: Mapping[str, str]) -> None:
     best = next(filter(None, (*named[:2], forces, named[2], [*units])), [])
     doubts = [*filter(None, (_doubt_on(p, name) for name in best))]
     if len(best) == 1 and not doubts:
-        p.description = replace(p.description, channels={best[0]: Channel(units[best[0]])})
+        p.put("channels", {best[0]: units[best[0]]})
         return
     text = f"one or several of: {listed(units)}" if units else "no column has numbers that change"
     text = "; ".join([text, *doubts])
@@ -197,20 +193,12 @@ def _doubt_on(p: Proposal, name: str) -> str:
     """
     if SET_VALUE.search(name):
         return f"{name} may be a set value"
-    if name in p.columns and (words := _strange_in(p.columns[name])):
+    if name in p.columns and (words := p.columns[name].strange):
         return f"{name} has words, {counts_of(words)}: do they mean a lost sample, text.missing?"
-    origin = p.tables[0].origin.get(name, ()) if ANY in name else ()
-    columns = match_numbered(name, origin)
+    columns = match_numbered(name, p.tables[0].origin.get(name, ()) if p.tables else ())
     steps = np.diff([float(match[1]) for match in columns])
     odd = np.flatnonzero(np.abs(steps - steps[:1]) > np.abs(steps[:1]) / 2)
     return f"{name} is not numbered evenly at {columns[odd[0] + 1][0]}" if len(odd) else ""
-
-
-def _strange_in(column: Column) -> Counter[str]:
-    """Return the texts in more than 1 % of the cells each, except for those in `LOST`."""
-    least = STRANGE * column.counts.total()
-    odd = column.odd.items()
-    return Counter({word: n for word, n in odd if word.lower() not in LOST and n > least})
 
 
 def _units(p: Proposal) -> dict[str, str]:
@@ -224,10 +212,9 @@ def _units(p: Proposal) -> dict[str, str]:
     units = dict[str, str]()
     for column in p.unused:
         name = column.name
-        odd = column.odd
-        n = column.counts.total()
-        most = SPARSE if _strange_in(column) else MOST_FREQUENT
-        is_number = len(column.counts) - len(odd) > 2 and odd.total() <= most * n
+        most = SPARSE if column.strange else MOST_FREQUENT
+        is_frequent = column.odd.total() <= most * column.counts.total()
+        is_number = is_frequent and len(column.counts) - len(column.odd) > 2
         is_other = is_clock(column) or COUNTER_NAME.fullmatch(name) or column.fixed
         if is_number and not is_other:
             units[name] = column.unit
@@ -246,7 +233,7 @@ def find_lost(p: Proposal) -> None:
     """
     rows = dict(p.description.rows)
     missing = {*p.description.text.missing}
-    for name in p.description.channels.keys() & p.columns.keys():
+    for name in p.description.channels:
         column = p.columns[name]
         lost = {word for word in column.odd if word.lower() in LOST}
         n_empty = column.counts[""] if p.description.time.column else 0
@@ -292,4 +279,4 @@ def list_others(p: Proposal) -> None:
     if UNKNOWN not in p.description.exclude and others:
         p.put("exclude", others)
     units = {column.name: column.unit for column in p.unused}
-    p.description = replace(p.description, ignored=units)
+    p.put("ignored", units)

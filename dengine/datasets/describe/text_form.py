@@ -7,7 +7,6 @@ import codecs
 import re
 from collections import Counter, defaultdict
 from collections.abc import Collection, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from itertools import product
 from statistics import mode
@@ -19,8 +18,8 @@ from ...errors import DataError, listed
 from ..dataset import Fault
 from ..description import UNKNOWN, TextForm
 from ..read.files import caught, natural_key
-from ..read.text import BLANK, COMMENT, header_names, split_line
-from ..table import pattern_of
+from ..read.text import BLANK, COMMENT, header_names, split_line, to_utf8
+from ..table import UnreadableError, pattern_of
 from ..units import is_unit
 from .columns import LEAST_RUN, NUMBER, Proposal, Stated
 
@@ -69,9 +68,9 @@ def look(content: bytes, stated: Stated) -> Look:
     only says that a doubt about the header is no error.
     """
     encoding, text = decode(content, str(stated.get("text.encoding", "")))
-    lines = re.split("\r\n|\r|\n", text.rstrip("\r\n"))
-    if "\0" in text or not text.strip():
-        raise DataError("Expected a text in text.encoding.")
+    lines = text.rstrip("\n").split("\n")
+    if not text.strip():
+        raise DataError("Expected a text, got an empty file.")
     marks = str(stated.get("text.delimiter", DELIMITERS))
     head = lines[:MOST_LINES]
     share, width, delimiter = max((*_share_of_numbers(head, mark), mark) for mark in marks)
@@ -87,20 +86,21 @@ def look(content: bytes, stated: Stated) -> Look:
 
 
 def decode(content: bytes, stated: str) -> tuple[str, str]:
-    """Return the encoding of a text, and the first 2 MB decoded; ("", "") if that fails.
+    """Return the encoding of a text, and its first 2 million characters, with plain line feeds.
 
     The `stated` encoding is used unless it is "". Otherwise it is UTF-16 if the text begins with
-    its byte order mark, else UTF-8, or cp1252 if UTF-8 fails. A byte order mark is left out, and a
-    character that is cut off at the end. Raises LookupError for a stated encoding that Python does
-    not know.
+    its byte order mark, else UTF-8, or cp1252 if UTF-8 fails. A byte order mark is left out. Raises
+    UnreadableError if the text is in none of them, and LookupError for a stated encoding that
+    Python does not know.
     """
     is_wide = content[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
-    encodings = ["utf-16"] if is_wide else ["utf-8", LATIN]
-    for encoding in [stated] if stated else encodings:
-        with suppress(UnicodeError):
-            text = codecs.getincrementaldecoder(encoding)().decode(content[:MOST_BYTES])
-            return encoding, text.removeprefix("\ufeff")
-    return "", ""
+    encoding = stated or ("utf-16" if is_wide else "utf-8")
+    try:
+        text = to_utf8(content, encoding)
+    except UnreadableError:
+        encoding = stated or LATIN
+        text = to_utf8(content, encoding)
+    return encoding, text.decode()[:MOST_BYTES]
 
 
 def _share_of_numbers(lines: Sequence[str], delimiter: str) -> tuple[float, int]:
