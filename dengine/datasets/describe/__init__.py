@@ -244,7 +244,7 @@ def propose_tables(p: Proposal, files: Tables) -> None:
     """
     p.is_cut |= any(len(table.lines) > MOST_ROWS for table in files)
     files = [table.take(slice(0, MOST_ROWS)) for table in files]
-    if "layout" not in p.stated or p.description.layout == "long":
+    if "layout" not in p.stated:
         p.put("layout", layout_of(p, files))
     if UNKNOWN in (p.description.layout, *p.description.part.column):
         p.notes["channels"] = "they follow from layout and part.column"
@@ -252,6 +252,6 @@ def propose_tables(p: Proposal, files: Tables) -> None:
     p.tables = parts_of(p, files)
     if not p.tables:
         raise DataError(f"Expected recordings in {listed(p.names)}, found none.")
-    if p.description.layout != "files" or len(p.tables) != len(files):
+    if p.description.layout != "files":
         p.names = ()
     propose_roles(p)

@@ -131,8 +131,10 @@ class Column:
 
 def columns_of(tables: Tables, form: TextForm) -> dict[str, Column]:
     """Return the columns of the first table by their names, each with the tables that have it."""
-    names = tables[0].columns if tables else ()
-    return {name: Column(name, [t for t in tables if name in t.columns], form) for name in names}
+    return {
+        name: Column(name, [table for table in tables if name in table.columns], form)
+        for name in tables[0].columns
+    }
 
 
 @dataclass

@@ -10,7 +10,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from itertools import permutations
-from typing import Any, Literal
+from typing import Any
 
 from ...errors import DataError
 from ..dataset import Fault
@@ -18,7 +18,7 @@ from ..description import UNKNOWN, Description, LabelSource, PartSource
 from ..read.files import caught
 from ..read.places import LabelReader, listing_table, part_of, read_labels, without_suffix
 from ..table import Table, UnreadableError
-from .columns import MOST_WORDS, Column, Proposal, Tables, counts_of
+from .columns import MOST_WORDS, Proposal, Tables, counts_of
 
 GOOD = (
     *("ok", "pass", "passed", "good", "success", "gut", "true", "i.o.", "i.o", "i_o", "io"),
@@ -59,7 +59,10 @@ PLACES = (  # of any words: folders, and the words of a file's name, counted fro
     "([^-_ /]+)(?:[-_ ][^-_ /]*){3}$",
     "(?:^|/)([^-_ /]+)[^/]*$",
 )
-NO_LABEL = "none was found that is certain: state label.column, path, line or listing"
+NO_LABEL = (
+    "none was found that is certain: state label.column, path, line or listing; label.at is `last` "
+    "if only the last row has the label"
+)
 KINDS = ("listing", "key", "column", "path", "line")
 Names = Iterable[str]
 Words = Mapping[str, str]  # by recording
@@ -140,18 +143,6 @@ def may_be_labels(source: LabelSource, words: Names) -> bool:
     return 2 - has_meaning(source, words) <= n <= MOST_WORDS
 
 
-def row_of(column: Column) -> Literal["", "same", "last"]:
-    """Return which row of a recording has the label, if this column holds it; "" if it cannot.
-
-    "same": each recording has one word in all rows. "last": the last row has the label, and all
-    others have the same word or one that means that the part is not checked, like "pending" or "".
-    """
-    if column.fixed:
-        return "same"
-    above = {word.lower() for words in column.words for word in {*words} - {*words[-1:]}}
-    return "last" if above <= {*UNCHECKED} else ""
-
-
 def lines_of(p: Proposal) -> list[str]:
     """Return how the lines above the header begin, up to the first `; : = , tab` or two blanks.
 
@@ -179,12 +170,11 @@ def part_words(source: PartSource, tables: Tables) -> Words:
 def sources_of(p: Proposal, paths: Names) -> Iterator[LabelSource]:
     """Yield the sources that may hold the labels.
 
-    They come in this order: pairs of columns of listings among `p.others`, of which one may be the
-    key, since it has more different words than half of its rows, and the other may hold labels;
-    regular expressions for the paths (if a file or a column is a part), of words like "ok" in them
-    and of any words at fixed places; columns without another use that may have the label in all
-    rows or the last; and lines above the header. A file that cannot be read as a listing is
-    skipped.
+    They come in this order: pairs of columns of listings among `p.others`, a key and a column that
+    may hold labels; regular expressions for the paths (if a file or a column is a part), of words
+    like "ok" in them and of any words at fixed places; columns without another use that have one
+    word in all rows of a recording; and lines above the header. A file that cannot be read as a
+    listing is skipped.
 
     paths : the path of each recording.
     """
@@ -193,15 +183,12 @@ def sources_of(p: Proposal, paths: Names) -> Iterator[LabelSource]:
         with suppress(DataError, ValueError):
             table = listing_table(p.base / name, p.description.text)
             for key, column in permutations(table.columns, 2):
-                if len({*table.words(key)}) > len(table.lines) / 2:
-                    source = replace(label, listing=name, key=key, column=column)
-                    if may_be_labels(source, table.words(column)):
-                        yield source
+                source = replace(label, listing=name, key=key, column=column)
+                if may_be_labels(source, table.words(column)):
+                    yield source
     if p.description.layout in ("files", "columns"):
         yield from (replace(label, path=path) for path in (*in_paths(paths), *PLACES))
-    for unused in p.unused:
-        if row := row_of(unused):
-            yield replace(label, column=unused.name, at=row)
+    yield from (replace(label, column=column.name) for column in p.unused if column.fixed)
     yield from (replace(label, line=line) for line in lines_of(p))
 
 

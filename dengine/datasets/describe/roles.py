@@ -18,7 +18,7 @@ from ..units import quantity_of
 from .clock import NAME as CLOCK_NAME
 from .clock import is_clock, propose_clock, propose_rate
 from .columns import LOST, MOST_WORDS, Column, Proposal, columns_of, counts_of
-from .labels import NAME, has_meaning, lines_of, part_words, propose_label, row_of
+from .labels import NAME, has_meaning, lines_of, part_words, propose_label
 from .layout import PART_NAME
 from .order import propose_order
 
@@ -54,8 +54,7 @@ def propose_roles(p: Proposal) -> None:
         expect_one_of(p.columns, name, "the columns")
     qualify_rows(p)
     propose_clock(p)
-    if p.description.layout not in ("long", "columns"):
-        propose_part(p)
+    propose_part(p)
     propose_label(p)
     propose_channels(p, _units(p))
     find_lost(p)
@@ -122,14 +121,17 @@ def qualifies(column: Column) -> bool:
 
     It must have at most 12 different words, they must change within a recording, and each recording
     must have several rows, with a cell in each. A column that is named like a status (`Status`,
-    `valid`) may have numbers, and also just one word in all. Any other must have texts, and no name
-    like a clock. A column that is named like a verdict, may have the label in one row (`row_of`),
-    and has a known word for good or bad holds labels instead, and gives False.
+    `valid`) may have numbers, and also just one word in all. Any other must have texts, or empty
+    cells if it is named like a verdict, and no name like a clock. A column that is named like a
+    verdict and has one word in each recording, of which any is known to mean good or bad, holds
+    labels instead, and gives False.
     """
     name = column.name
     words = column.counts
     is_named = QUALIFIER_NAME.search(name) is not None
-    is_text = any(column.odd) and not CLOCK_NAME.search(name)
+    is_verdict = NAME.fullmatch(name) is not None
+    has_words = any(column.odd) or (is_verdict and column.odd)  # or beside empty cells, a number
+    is_text = has_words and not CLOCK_NAME.search(name)
     varies = not column.fixed or (is_named and len(words) == 1)
     has_rows = all(
         len(cells) == max(map(len, table.columns.values())) > 1
@@ -137,8 +139,7 @@ def qualifies(column: Column) -> bool:
     )
     if not (is_named or is_text) or not varies or not has_rows or len(words) > MOST_WORDS:
         return False
-    is_verdict = NAME.fullmatch(name) and row_of(column)
-    return not (is_verdict and has_meaning(LabelSource(column=name), words))
+    return not (is_verdict and column.fixed and has_meaning(LabelSource(column=name), words))
 
 
 def propose_part(p: Proposal) -> None:

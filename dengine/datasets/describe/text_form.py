@@ -5,12 +5,11 @@ Each value follows from a count over the lines that were looked at. If two value
 
 import codecs
 import re
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import product
 from statistics import mode
-from typing import Any
 
 import numpy as np
 
@@ -194,21 +193,21 @@ def propose_form(p: Proposal, contents: Mapping[str, bytes], faults: list[Fault]
 
     contents : the contents of the files that are looked at, by name.
     """
-    groups = defaultdict[Any, dict[str, Look]](dict)
+    looks = dict[str, Look]()
     for name, content in contents.items():
         with caught(faults, name):
-            item = look(content, p.stated)
-            groups[item.form.delimiter, item.width, item.line][name] = item
-    same = max(groups.values(), key=len, default={})
-    odd = {name: item for group in groups.values() for name, item in group.items()}
-    odd = {name: item for name, item in odd.items() if name not in same}
+            looks[name] = look(content, p.stated)
+    forms = {name: (item.form.delimiter, item.width, item.line) for name, item in looks.items()}
+    usual = mode([*forms.values(), ()])
+    same = [name for name, form in forms.items() if form == usual]
+    odd = [name for name, form in forms.items() if form != usual]
     p.others = [*p.others, *odd]
     p.names = [name for name in p.names if name not in odd]
-    if sum(len(item.rows) >= LEAST_RUN for item in odd.values()) > 1:
+    if sum(len(looks[name].rows) >= LEAST_RUN for name in odd) > 1:
         p.put("exclude", UNKNOWN, f"are {listed(odd)} recordings of another form? See files")
     if same:
-        _propose_keys(p, [*same.values()])
-    return [*same]
+        _propose_keys(p, [looks[name] for name in same])
+    return same
 
 
 def _propose_keys(p: Proposal, looks: Sequence[Look]) -> None:
@@ -258,7 +257,7 @@ def _column_names(usual: Look) -> Sequence[str]:
         return names if len(cells) != width else []
     if width < MOST_NAMES:
         return [f"c{i}" for i in range(width)]
-    firsts = {row[0] for row in usual.rows}
+    firsts = {row[0] for row in usual.rows if row}
     is_class = 1 < len(firsts) <= MOST_CLASSES and all(map(WHOLE.fullmatch, firsts))
     return ["class", "x*"] if is_class else ["x*"]
 
