@@ -53,18 +53,18 @@ def propose_clock(p: Proposal) -> None:
     """Find the column of times and its form, and set `time.column` and `time.format` in `p`.
 
     `time.column` is set to `?`, with a note, if several columns may tell the time or a part of it,
-    like a date that is the same in all rows of a recording; such a date is not looked for beside a
-    clock whose cells tell the day. It is `?`, too, if no column may (`is_clock`), but the columns
-    have no names, or one is named `s`, which may be seconds or the stroke. Otherwise, if no column
-    may, it stays empty. Stated columns are kept; only their forms are found. Raises SettingError
-    for a malformed `windows.trigger`.
+    like a date or whole seconds that are the same in all rows of a recording; these are not looked
+    for beside a clock whose cells tell the day. It is `?`, too, if no column may (`is_clock`), but
+    the columns have no names, or one is named `s`, which may be seconds or the stroke. Otherwise,
+    if no column may, it stays empty. Stated columns are kept; only their forms are found. Raises
+    SettingError for a malformed `windows.trigger`.
     """
     clocks = [column for column in p.columns.values() if is_clock(column)]
     if is_stated := "time.column" in p.stated:
         clocks = [p.columns[name] for name in p.description.time.column]
     has_days = any(has_day(form) for column in clocks for form in column.forms)
-    coarse = [] if has_days else [c for c in p.unused if c.forms or is_coarse(c)]
-    names = [c.name for c in p.columns.values() if c in clocks or c in coarse]
+    coarse = [c for c in p.unused if c.forms or (NAME.search(c.name) and len({*c.fixed}) > 1)]
+    names = [c.name for c in p.columns.values() if c in clocks or (c in coarse and not has_days)]
     if not clocks:
         has_no_names = "c0" in p.description.text.names or "s" in p.columns  # may be the stroke
         names = [*p.columns] if has_no_names else []
@@ -90,14 +90,6 @@ def is_clock(column: Column) -> bool:
     if not is_named or quantity_of(column.unit):
         return False
     return bool((column.steps > 0).any() and (column.steps < 0).sum() <= FEW * len(column.steps))
-
-
-def is_coarse(column: Column) -> bool:
-    """Return whether a column is named like a clock and changes only from recording to recording.
-
-    Seconds beside a column of nanoseconds may do so.
-    """
-    return NAME.search(column.name) is not None and len({*column.fixed}) > 1
 
 
 def form_of(column: Column, p: Proposal, is_alone: bool) -> str:
@@ -159,7 +151,7 @@ def _unit_by_size(column: Column, p: Proposal) -> str:
 
 def is_rate(step: float) -> bool:
     """Return whether a step in seconds is of a rate that forces are recorded at, 1 Hz to 1 MHz."""
-    return step > 0 and LEAST_RATE_HZ <= 1 / step <= MOST_RATE_HZ
+    return 1 / MOST_RATE_HZ <= step <= 1 / LEAST_RATE_HZ
 
 
 def propose_rate(p: Proposal, tables: Tables) -> None:

@@ -30,7 +30,6 @@ FORMS = (DAY, ISO, *DAYS, *TIMES, "%M:%S.%f", *ZONED, *MOMENTS)
 LIKE_A_TIME = re.compile(r"\d+[:\-./T](\d+|[A-Za-z]{3})[:\-./T]\d|\d+:\d+\.\d|\d{8}T\d{6}")
 LEAST_RUN = 8  # rows of a part
 MOST_WORDS = 12  # that are told apart, as labels
-STRANGE = 0.01
 LOST = ("nan", "null", "none", "n/a", "na", "-", "--", "---", "#n/a", "")
 MOST_CELLS = 20  # of a recording whose form of times is looked at
 # A number with any decimal mark and any mark of groups.
@@ -69,12 +68,10 @@ class Column:
         """How often each word comes that is not a number with any decimal mark."""
         return Counter({w: n for w, n in self.counts.items() if not NUMBER.fullmatch(w)})
 
-    @property
+    @cached_property
     def strange(self) -> Counter[str]:
-        """The texts in more than 1 % of the cells each that do not mean a lost sample (`LOST`)."""
-        least = STRANGE * self.counts.total()
-        odd = self.odd.items()
-        return Counter({w: n for w, n in odd if w.lower() not in LOST and n > least})
+        """How often each word comes that is no number and does not mean a lost sample (`LOST`)."""
+        return Counter({w: n for w, n in self.odd.items() if w.lower() not in LOST})
 
     @cached_property
     def fixed(self) -> list[str]:
@@ -86,14 +83,13 @@ class Column:
     def numbers(self) -> list[Floats]:
         """The numbers of each recording whose cells are all numbers, as `[text]` writes them.
 
-        A word of `text.missing` is NaN. Recordings with other cells are left out; if they are more
-        than 10 %, the list is empty.
+        A word of `text.missing` is NaN. Recordings with other cells are left out.
         """
         numbers = list[Floats]()
         for table in self.tables:
             with suppress(DataError):
                 numbers.append(table.numbers(self.name, self.form))
-        return numbers if len(numbers) >= 0.9 * len(self.tables) else []
+        return numbers
 
     @cached_property
     def steps(self) -> Floats:

@@ -14,7 +14,7 @@ from typing import Any
 
 from ...errors import DataError
 from ..dataset import Fault
-from ..description import UNKNOWN, Description, LabelSource, PartSource
+from ..description import SOURCES, UNKNOWN, Description, LabelSource, PartSource
 from ..read.files import caught
 from ..read.places import LabelReader, listing_table, part_of, read_labels, without_suffix
 from ..table import Table, UnreadableError
@@ -63,7 +63,6 @@ NO_LABEL = (
     "none was found that is certain: state label.column, path, line or listing; label.at is `last` "
     "if only the last row has the label"
 )
-KINDS = ("listing", "key", "column", "path", "line")
 Names = Iterable[str]
 Words = Mapping[str, str]  # by recording
 Meanings = Mapping[str, int | None]  # by recording: 1 good, 0 bad, None unchecked
@@ -270,12 +269,11 @@ def propose_label(p: Proposal) -> None:
     whose meaning is open. Otherwise `label.column` is `?`, with a note that lists all sources.
     Further known sources that have a word for each recording of the label become checks, unless
     checks are stated; a note counts the words of the label, also on `label.good` and `label.bad` if
-    these are `?`. A stated `label.topic` alone is no stated source here. Raises DataError if a
-    stated source has no words or cannot be read, and SettingError for a malformed
-    `windows.trigger`.
+    these are `?`. Raises DataError if a stated source has no words or cannot be read, and
+    SettingError for a malformed `windows.trigger`.
     """
     label = p.description.label
-    stated = [label] if any(getattr(label, kind) for kind in KINDS) else []
+    stated = [label] if any(getattr(label, kind) for kind in SOURCES["label"]) else []
     counted = count_sources(p, stated)
     meanings = {source: meanings_of(source, words) for source, words in counted.items()}
     named = [source for source in counted if stated or is_named_like_verdict(source)]
@@ -297,7 +295,7 @@ def propose_label(p: Proposal) -> None:
     words = counted[label]
     checks = tuple(source for source in certain[1:] if counted[source].keys() >= words.keys())
     p.description = replace(p.description, label=label, check=p.description.check or checks)
-    place = next(kind for kind in KINDS if getattr(label, kind))
+    place = next(kind for kind in SOURCES["label"] if getattr(label, kind))
     unclear = [key for key in ("good", "bad") if UNKNOWN in getattr(label, key)]
     note = f"{counts_of(words.values())}, over {len(words):,} recordings"
     p.notes[f"label.{place}"] = note

@@ -47,10 +47,10 @@ def layout_of(p: Proposal, files: Tables) -> str:
     runs = [name for name, column in columns.items() if may_tell_parts(column)]
     stated = p.description.part.column
     if runs or stated:
-        named = [*filter(PART_NAME.search, columns)]
         unique = [name for name in runs if words_in(columns[name]) == len(columns[name].counts)]
-        likely = [name for name in unique if name in named]
+        likely = [*filter(PART_NAME.search, unique)]
         long = [name for name, column in columns.items() if has_long_runs(column)]
+        named = filter(PART_NAME.search, columns)
         note = f"one of {listed(dict.fromkeys([*named, *long]))}, or several"
         p.put("part.column", *(likely if len(likely) == 1 else (UNKNOWN, note)))
         return "long"

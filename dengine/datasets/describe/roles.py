@@ -17,13 +17,13 @@ from ..read.split import match_numbered
 from ..units import quantity_of
 from .clock import NAME as CLOCK_NAME
 from .clock import is_clock, propose_clock, propose_rate
-from .columns import LOST, MOST_WORDS, Column, Proposal, columns_of, counts_of
+from .columns import MOST_WORDS, Column, Proposal, columns_of, counts_of
 from .labels import NAME, has_meaning, lines_of, part_words, propose_label
 from .layout import PART_NAME
 from .order import propose_order
 
-MOST_FREQUENT = 0.9  # of the rows, if the others are of another signal
 SPARSE = 0.1
+STRANGE = 0.01
 PART_LINE = re.compile(r"(?i)serial|barcode|dmc|part ?(no|num|id)|teilenummer|werkst.ck|serien")
 QUALIFIER_NAME = re.compile(r"(?i)status|valid|quality|flag|error|state")
 COUNTER_NAME = re.compile(r"(?i)(index|row|sample|n|i|punkt|point|count|nr|no|line)s?")
@@ -106,7 +106,10 @@ def qualify_rows(p: Proposal) -> None:
         key = "drop" if about.keep else "keep"
         words = rest if len(rest) <= MOST_WORDS else (ANY,)
         rows[name] = replace(about, **{key: getattr(about, key) + words})
-    for column in filter(qualifies, p.unused):
+    n_rows = max(column.counts.total() for column in p.columns.values())
+    for column in p.unused:
+        if not qualifies(column, n_rows):
+            continue
         words = tuple(column.counts)
         if len(words) > 1:
             text = f"which rows are samples? {counts_of(column.counts)}; others drop or invalid"
@@ -116,15 +119,15 @@ def qualify_rows(p: Proposal) -> None:
     set_rows(p, rows)
 
 
-def qualifies(column: Column) -> bool:
+def qualifies(column: Column, n_rows: int) -> bool:
     """Return whether the words of a column may tell which rows are samples.
 
-    It must have at most 12 different words, they must change within a recording, and each recording
-    must have several rows, with a cell in each. A column that is named like a status (`Status`,
-    `valid`) may have numbers, and also just one word in all. Any other must have texts, or empty
-    cells if it is named like a verdict, and no name like a clock. A column that is named like a
-    verdict and has one word in each recording, of which any is known to mean good or bad, holds
-    labels instead, and gives False.
+    It must have at most 12 different words, they must change within a recording, and it must have a
+    cell in each of the `n_rows` rows of all recordings. A column that is named like a status
+    (`Status`, `valid`) may have numbers, and also just one word in all. Any other must have texts,
+    or empty cells if it is named like a verdict, and no name like a clock. A column that is named
+    like a verdict and has one word in each recording, of which any is known to mean good or bad,
+    holds labels instead, and gives False.
     """
     name = column.name
     words = column.counts
@@ -133,11 +136,8 @@ def qualifies(column: Column) -> bool:
     has_words = any(column.odd) or (is_verdict and column.odd)  # or beside empty cells, a number
     is_text = has_words and not CLOCK_NAME.search(name)
     varies = not column.fixed or (is_named and len(words) == 1)
-    has_rows = all(
-        len(cells) == max(map(len, table.columns.values())) > 1
-        for cells, table in zip(column.words, column.tables, strict=True)
-    )
-    if not (is_named or is_text) or not varies or not has_rows or len(words) > MOST_WORDS:
+    is_full = words.total() == n_rows
+    if not (is_named or is_text) or not varies or not is_full or len(words) > MOST_WORDS:
         return False
     return not (is_verdict and column.fixed and has_meaning(LabelSource(column=name), words))
 
@@ -187,15 +187,12 @@ def propose_channels(p: Proposal, units: Mapping[str, str]) -> None:
 def _doubt_on(p: Proposal, name: str) -> str:
     """Return the first reason why a column may not be a channel; "" if there is none.
 
-    The reasons: the column is named like a set value or a limit; a text that does not mean a lost
-    sample is in more than 1 % of its cells; `name` is like `x*` and stands for the columns `x0`,
-    `x1`, ..., and a step between two of their numbers differs from the first step by more than half
-    of it.
+    The reasons: the column is named like a set value or a limit; `name` is like `x*` and stands for
+    the columns `x0`, `x1`, ..., and a step between two of their numbers differs from the first step
+    by more than half of it.
     """
     if SET_VALUE.search(name):
         return f"{name} may be a set value"
-    if name in p.columns and (words := p.columns[name].strange):
-        return f"{name} has words, {counts_of(words)}: do they mean a lost sample, text.missing?"
     columns = match_numbered(name, p.tables[0].origin.get(name, ()) if p.tables else ())
     steps = np.diff([float(match[1]) for match in columns])
     odd = np.flatnonzero(np.abs(steps - steps[:1]) > np.abs(steps[:1]) / 2)
@@ -206,18 +203,16 @@ def _units(p: Proposal) -> dict[str, str]:
     """Return the columns that may be channels, with their units; "" for no unit.
 
     Such a column has no other use in the description so far, and at least three different numbers.
-    At most 90 % of its cells are no numbers, or 10 % if a text that does not mean a lost sample is
-    in more than 1 % of them. Times, columns named like counters of rows, and columns that are
-    constant in each recording are left out. Raises SettingError for a malformed `windows.trigger`.
+    At most 10 % of its cells are texts that do not mean a lost sample. Times, columns named like
+    counters of rows, and columns that are constant in each recording are left out. Raises
+    SettingError for a malformed `windows.trigger`.
     """
     units = dict[str, str]()
     for column in p.unused:
         name = column.name
-        most = SPARSE if column.strange else MOST_FREQUENT
-        is_frequent = column.odd.total() <= most * column.counts.total()
-        is_number = is_frequent and len(column.counts) - len(column.odd) > 2
+        is_text = column.strange.total() > SPARSE * column.counts.total()
         is_other = is_clock(column) or COUNTER_NAME.fullmatch(name) or column.fixed
-        if is_number and not is_other:
+        if not is_text and not is_other and len(column.counts) - len(column.odd) > 2:
             units[name] = column.unit
     return units
 
@@ -225,26 +220,29 @@ def _units(p: Proposal) -> dict[str, str]:
 def find_lost(p: Proposal) -> None:
     """Set `text.missing` in `p` to the words that stand for lost samples (cells without a value).
 
-    They are those already there, and those of the words nan, null, none, n/a, na, -, --, ---, #n/a
-    and "", an empty cell, that a channel has, in any case of letters. If more than 10 % of the
-    cells of a channel are empty, "" is not added for it if `time.column` is set, even to `?`: these
-    rows belong to another signal. `[rows]` then drops them, unless it has words of this channel
-    already, and a note says so in any case; dropped rows are left out of `p.columns`. A stated
-    `text.missing` stays, but `[rows]` changes all the same.
+    They are those already there, and those of `LOST`, also the empty cell, that a channel has, in
+    any case of letters. If another text is in more than 1 % of a channel's cells, `text.missing` is
+    `?`, with a note. If more than 10 % of the cells of a channel are empty, "" is not added for it
+    if `time.column` is set, even to `?`: these rows belong to another signal. `[rows]` then drops
+    them, unless it has words of this channel already; dropped rows are left out of `p.columns`. A
+    stated `text.missing` stays, but `[rows]` changes all the same.
     """
     rows = dict(p.description.rows)
     missing = {*p.description.text.missing}
+    strange = dict[str, int]()
     for name in p.description.channels:
         column = p.columns[name]
-        lost = {word for word in column.odd if word.lower() in LOST}
-        n_empty = column.counts[""] if p.description.time.column else 0
-        if n_empty > SPARSE * column.counts.total():
+        n = column.counts.total()
+        lost = column.odd.keys() - column.strange.keys()
+        if p.description.time.column and column.counts[""] > SPARSE * n:
             lost -= {""}
             rows.setdefault(name, RowWords((ANY,), ("",)))
-            p.notes[f"rows.{name}.drop"] = "rows without a value are no samples of it"
         missing |= lost
+        strange |= {word: k for word, k in column.strange.items() if k > STRANGE * n}
     set_rows(p, rows)
     p.put("text.missing", sorted(missing))
+    if strange:
+        p.put("text.missing", UNKNOWN, f"do these mean a lost sample? {counts_of(strange)}")
 
 
 def propose_lengths(p: Proposal) -> None:

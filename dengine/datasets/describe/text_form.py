@@ -7,9 +7,10 @@ import codecs
 import re
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from itertools import product
 from statistics import mode
+from typing import NamedTuple
 
 import numpy as np
 
@@ -39,8 +40,7 @@ UNIT_WORDS = re.compile(
 Rows = Sequence[Sequence[str]]
 
 
-@dataclass(frozen=True, slots=True)
-class Look:
+class Look(NamedTuple):
     """The first lines of a file.
 
     form : of the file. width : cells of a row. line : the header. rows : the cells of the samples.
@@ -244,8 +244,8 @@ def _column_names(usual: Look) -> Sequence[str]:
     it has fewer cells than there are columns, the last ones are named `column3`, `column4`, ...
     Without a header, or if it has more words than there are columns, the names are `c0`, `c1`, ...;
     for 20 columns or more it is `x*`, which names all of them. Such a table may have a part in each
-    row: if its first column has 2 to 12 different words, all whole numbers, it is named `class`,
-    before `x*`.
+    row: if its first column has 2 to 12 different words, all whole numbers, and fewer of them than
+    the second, it is named `class`, before `x*`.
 
     usual : how a typical file is written, and the cells of its samples.
     """
@@ -257,9 +257,9 @@ def _column_names(usual: Look) -> Sequence[str]:
         return names if len(cells) != width else []
     if width < MOST_NAMES:
         return [f"c{i}" for i in range(width)]
-    firsts = {row[0] for row in usual.rows if row}
-    is_class = 1 < len(firsts) <= MOST_CLASSES and all(map(WHOLE.fullmatch, firsts))
-    return ["class", "x*"] if is_class else ["x*"]
+    firsts, seconds = ({row[i] for row in usual.rows if len(row) > i} for i in (0, 1))
+    is_class = 1 < len(firsts) <= min(MOST_CLASSES, len(seconds) - 1)
+    return ["class", "x*"] if is_class and all(map(WHOLE.fullmatch, firsts)) else ["x*"]
 
 
 def propose_marks(p: Proposal, cells: Collection[str]) -> None:
