@@ -116,7 +116,7 @@ def choose_files(p: Proposal, root: Path) -> bool:
     """
     stated = p.description.files
     every = names_in(root, ())
-    names = names_in(root, stated) if stated else every
+    names = names_in(root, stated)
     if not names:
         raise DataError(f"Expected files of recordings, {listed(SUFFIXES)}, in {root}, got none.")
     endings = likely_endings(names)

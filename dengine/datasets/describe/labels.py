@@ -169,11 +169,11 @@ def part_words(source: PartSource, tables: Tables) -> Words:
 def sources_of(p: Proposal, paths: Names) -> Iterator[LabelSource]:
     """Yield the sources that may hold the labels.
 
-    They come in this order: pairs of columns of listings among `p.others`, a key and a column that
-    may hold labels; regular expressions for the paths (if a file or a column is a part), of words
-    like "ok" in them and of any words at fixed places; columns without another use that have one
-    word in all rows of a recording; and lines above the header. A file that cannot be read as a
-    listing is skipped.
+    They come in this order: pairs of columns of listings among `p.others`, of which one may be the
+    key, since it has more different words than half of its rows, and the other may hold labels;
+    regular expressions for the paths (if a file or a column is a part), of words like "ok" in them
+    and of any words at fixed places; columns without another use that have one word in all rows of
+    a recording; and lines above the header. A file that cannot be read as a listing is skipped.
 
     paths : the path of each recording.
     """
@@ -182,9 +182,10 @@ def sources_of(p: Proposal, paths: Names) -> Iterator[LabelSource]:
         with suppress(DataError, ValueError):
             table = listing_table(p.base / name, p.description.text)
             for key, column in permutations(table.columns, 2):
-                source = replace(label, listing=name, key=key, column=column)
-                if may_be_labels(source, table.words(column)):
-                    yield source
+                if len({*table.words(key)}) > len(table.lines) / 2:
+                    source = replace(label, listing=name, key=key, column=column)
+                    if may_be_labels(source, table.words(column)):
+                        yield source
     if p.description.layout in ("files", "columns"):
         yield from (replace(label, path=path) for path in (*in_paths(paths), *PLACES))
     yield from (replace(label, column=column.name) for column in p.unused if column.fixed)

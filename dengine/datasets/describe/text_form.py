@@ -66,11 +66,11 @@ def look(content: bytes, stated: Stated) -> Look:
     stated : keys that the user gave. `text.encoding` and `text.delimiter` are taken; `text.header`
     only says that a doubt about the header is no error.
     """
-    encoding, text = decode(content, str(stated.get("text.encoding", "")))
+    encoding, text = decode(content, stated.get("text.encoding", ""))
     lines = text.rstrip("\n").split("\n")
     if not text.strip():
         raise DataError("Expected a text, got an empty file.")
-    marks = str(stated.get("text.delimiter", DELIMITERS))
+    marks = stated.get("text.delimiter", DELIMITERS)
     head = lines[:MOST_LINES]
     share, width, delimiter = max((*_share_of_numbers(head, mark), mark) for mark in marks)
     if share == 0:  # a single column
