@@ -4,7 +4,6 @@ A value is written only if a rule proves it, with its evidence as a comment; els
 the candidates. `load_dataset` then reads exactly what the description says.
 """
 
-import itertools
 import math
 import re
 from collections import Counter
@@ -126,7 +125,7 @@ def choose_files(p: Proposal, root: Path) -> bool:
         return False
     p.base = root if root.is_dir() else root.parent
     p.names = names if stated else [name for name in names if suffix_of(name) == endings[0]]
-    p.others = [name for name in every if name not in {*p.names}]
+    p.others = sorted({*every}.difference(p.names), key=natural_key)
     p.put("files", globs(p.names))
     p.put("format", SUFFIXES.get(suffix_of(p.names[0]), "text"))
     return True
@@ -171,8 +170,8 @@ def names_in(root: Path, patterns: Names) -> Names:
     if root.is_file():
         return [root.name]
     names = match_files(root, patterns or ["**/*"])
-    names = {name for name in names if patterns or suffix_of(name) in SUFFIXES}
-    return sorted(itertools.filterfalse(NO_RECORDING.search, names), key=natural_key)
+    names -= {*filter(NO_RECORDING.search, names)}
+    return sorted((n for n in names if patterns or suffix_of(n) in SUFFIXES), key=natural_key)
 
 
 def globs(names: Names) -> list[str]:
