@@ -31,8 +31,8 @@ def layout_of(p: Proposal, files: Tables) -> str:
     Several JSON or .ts files, of which the first has one row, are `files`. Lists in the first row
     of the first table, or 20 or more columns like `x0`, `x1`, make it `wide`, or `npz` for an .npz
     file. It is `long` if a column of the first table may tell the parts apart (`may_tell_parts`),
-    or if the user stated `part.column`; unless it is stated, `part.column` is then set
-    in `p` to the only such column with a name like that of a part's number and no word in two
+    or if a file has several words of a stated `part.column`; unless it is stated, `part.column` is
+    then set in `p` to the only such column with a name like that of a part's number and no word in two
     files, or to `?` with a note. Several tables are `files`. A single one gives `?`, with a note on
     what to state, or DataError if it is a table of results: one row for each part, with its label,
     and no samples. Raises UnreadableError if cells of columns that are looked at are lists.
@@ -45,8 +45,8 @@ def layout_of(p: Proposal, files: Tables) -> str:
         return "npz" if kind == "npz" else "wide"
     columns = columns_of(files, TextForm())
     runs = [name for name, column in columns.items() if may_tell_parts(column)]
-    stated = p.description.part.column
-    if runs or stated:
+    stated = [columns[name] for name in p.description.part.column if name in columns]
+    if runs or any(words_in(column) > len(files) for column in stated):
         unique = [name for name in runs if words_in(columns[name]) == len(columns[name].counts)]
         likely = [*filter(PART_NAME.search, unique)]
         long = [name for name, column in columns.items() if has_long_runs(column)]
