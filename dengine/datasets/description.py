@@ -194,6 +194,12 @@ class LabelSource:
     bad: Words = ()
     unchecked: Words = ()
 
+    @property
+    def meanings(self) -> dict[str, int | None]:
+        """What each word means: 1 good, 0 bad, None not checked; of several, the first of these."""
+        meanings: dict[str, int | None] = dict.fromkeys(self.unchecked)
+        return meanings | dict.fromkeys(self.bad, 0) | dict.fromkeys(self.good, 1)
+
 
 @dataclass(frozen=True, slots=True)
 class Windows:

@@ -4,14 +4,13 @@ A value is written only if a rule proves it, with its evidence as a comment; els
 the candidates. `load_dataset` then reads exactly what the description says.
 """
 
-import itertools
 import math
 import re
 from collections import Counter
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
+from statistics import mode
 from typing import Any
 
 import numpy as np
@@ -21,15 +20,14 @@ from ..checks import check_text
 from ..dataset import Fault
 from ..description import UNKNOWN, Description, flat
 from ..read.files import as_source, caught, match_files, natural_key, read_file
-from ..read.frames import read_frame, read_npz
+from ..read.frames import read_frame
 from ..read.places import without_suffix
 from ..read.split import table_of
 from ..read.text import read_text
-from ..table import Table, UnreadableError
+from ..table import Table
 from .bags import propose_bag
 from .columns import Proposal, Stated, Tables
-from .labels import WORD
-from .layout import has_lists, layout_of, parts_of
+from .layout import layout_of, parts_of
 from .roles import propose_roles
 from .text_form import MOST_BYTES, decode, propose_form
 
@@ -108,65 +106,50 @@ def choose_files(p: Proposal, root: Path) -> bool:
     """Set in `p` which files are the recordings, and their format; return whether that is clear.
 
     If the user stated `files`, they are these. Otherwise they are the files in `root` with the only
-    suffix that several files have; the suffix of a bag, `.mcap`, counts even for one file. If no
-    suffix qualifies, all suffixes do. If several suffixes qualify, or each part has several files
-    with the names of signals in them (`signal_endings`), `files` is set to `?` with a note that
-    lists the choices, a note on `channels` says so, and the result is False. Otherwise `p.base`
-    becomes the folder, `p.names` these files and `p.others` the other files that `names_in` finds
-    without patterns. `files` becomes `globs` of the names, and `format` that of the first file's
-    suffix, `text` for an unknown one; stated keys stay. Raises DataError if there is no file of
-    recordings or a stated pattern is malformed.
+    likely ending (`likely_endings`). If there are several, `files` is set to `?` with a note that
+    lists them, a note on `channels` says so, and the result is False. Otherwise `p.base` becomes
+    the folder, `p.names` these files and `p.others` the other files that `names_in` finds without
+    patterns. `files` becomes `globs` of the names, and `format` that of the first file's suffix,
+    `text` for an unknown one; stated keys stay. Raises DataError if there is no file of recordings
+    or a stated pattern is malformed.
     """
     stated = p.description.files
     every = names_in(root, ())
-    names = names_in(root, stated) if stated else every
+    names = names_in(root, stated)
     if not names:
         raise DataError(f"Expected files of recordings, {listed(SUFFIXES)}, in {root}, got none.")
-    likely = likely_suffixes(names)
-    endings = signal_endings(names) if len(likely) == 1 else ()
-    if len(likely) + len(endings) > 1 and not stated:
-        counts = Counter(map(suffix_of, names))
-        choices = (
-            [*endings, *likely]
-            if endings
-            else (f"{suffix} ({n} files)" for suffix, n in counts.items())
-        )
-        text = listed(f"**/*{choice}" for choice in choices)
-        p.put("files", UNKNOWN, f"one of {text}")
+    endings = likely_endings(names)
+    if len(endings) > 1 and not stated:
+        p.put("files", UNKNOWN, f"one of {listed(f'**/*{ending}' for ending in endings)}")
         p.notes["channels"] = "they follow from files"
         return False
     p.base = root if root.is_dir() else root.parent
-    p.names = names if stated else [name for name in names if suffix_of(name) == likely[0]]
-    p.others = [name for name in every if name not in {*p.names}]
+    p.names = names if stated else [name for name in names if suffix_of(name) == endings[0]]
+    p.others = sorted({*every}.difference(p.names), key=natural_key)
     p.put("files", globs(p.names))
     p.put("format", SUFFIXES.get(suffix_of(p.names[0]), "text"))
     return True
 
 
-def likely_suffixes(names: Names) -> Names:
-    """Return the suffixes that several files have, and `.mcap` if one file has it; or else all."""
-    counts = Counter(map(suffix_of, names))
-    return [suffix for suffix, n in counts.items() if n > 1 or suffix == BAG] or [*counts]
+def likely_endings(names: Names) -> Names:
+    """Return the endings of file names of which one may tell the recordings from other files.
 
-
-def signal_endings(names: Names) -> Names:
-    """Return the endings of file names, if they tell signals apart: `Kraft.csv` of `1_Kraft.csv`.
-
-    An ending is the last word with its suffix, and what stands before it is the part. There must be
-    two parts and two endings or more, and each part must have a file with each ending. If not, or
-    if an ending has a digit or ends with a word like `ok` or `pending`, the result is empty. Digits
-    are allowed with 2 to 4 endings and 10 parts or more: numbered pieces of a part's curve.
+    They are the suffixes that several files have, and `.mcap` if one file has it; or else all. If
+    there is only one, the endings that tell signals apart come before it: `Kraft.csv` of
+    `1_Kraft.csv`, the last word with its suffix, behind the part. There must be two parts and two
+    such endings or more, and each part must have a file with each ending. Endings with digits count
+    only if there are 2 to 4 of them and 10 parts or more: numbered pieces of a part's curve.
     """
+    counts = Counter(map(suffix_of, names))
+    likely = [suffix for suffix, n in counts.items() if n > 1 or suffix == BAG] or [*counts]
     words = [re.split(r"[-_ ](?=[^-_ /]+$)", name) for name in names]
-    endings = sorted({name[-1] for name in words})
     n_parts = len({name[0] for name in words})
-    has_all = n_parts * len(endings) == len(names) and min(n_parts, len(endings)) > 1
+    endings = sorted({name[-1] for name in words})
+    is_grid = n_parts * len(endings) == len(names) and min(n_parts, len(endings)) > 1
     may_be_pieces = len(endings) <= MOST_PIECES and n_parts >= LEAST_PARTS
-    text = " ".join(endings)
-    is_other = re.search(rf"(?i)\b({WORD})\.", text) or (
-        re.search(r"\d", text) and not may_be_pieces
-    )
-    return endings if has_all and not is_other else ()
+    is_numbered = re.search(r"\d", "".join(endings)) is not None
+    is_signal = len(likely) == 1 and is_grid and (may_be_pieces or not is_numbered)
+    return [*endings, *likely] if is_signal else likely
 
 
 def suffix_of(name: str) -> str:
@@ -187,8 +170,8 @@ def names_in(root: Path, patterns: Names) -> Names:
     if root.is_file():
         return [root.name]
     names = match_files(root, patterns or ["**/*"])
-    names = {name for name in names if patterns or suffix_of(name) in SUFFIXES}
-    return sorted(itertools.filterfalse(NO_RECORDING.search, names), key=natural_key)
+    names -= {*filter(NO_RECORDING.search, names)}
+    return sorted((n for n in names if patterns or suffix_of(n) in SUFFIXES), key=natural_key)
 
 
 def globs(names: Names) -> list[str]:
@@ -198,74 +181,53 @@ def globs(names: Names) -> list[str]:
     return sorted(f"{folders}*{end}" for end in endings) if len(names) > 1 else [*names]
 
 
-def contents_of(p: Proposal) -> dict[str, bytes]:
-    """Return the contents of at most 60 of the files `p.names`, evenly spread over all, by name.
+def read_tables(p: Proposal) -> list[Table]:
+    """Return the tables of some of the files `p.names`, at least one, with the same column names.
 
-    No further file is read once 2 MB were read; a file is always read whole. Files that cannot be
-    read are left out.
+    At most 60 files are read, spread evenly over all, and no further file once 2 MB were read. Of
+    text files only those count whose form is the most frequent: the keys of `[text]` are set in `p`
+    first (`propose_form`). Tables with other column names than the most frequent ones, of equal
+    ones the first, are left out, and so are damaged files. `p.is_cut` is set if only the beginning
+    of a file is used. Raises DataError if no file can be read, also because the package that reads
+    such files is missing.
     """
     contents = dict[str, bytes]()
+    faults = list[Fault]()
     for name in p.names[:: math.ceil(len(p.names) / MOST_FILES)]:
         if sum(map(len, contents.values())) < MOST_BYTES:
-            with suppress(UnreadableError):
+            with caught(faults, name):
                 contents[name] = read_file(p.base / name)
-    return contents
-
-
-def read_tables(p: Proposal) -> list[Table]:
-    """Return the tables of some of the files `p.names`, with the same column names.
-
-    At most 60 files are read, spread evenly, and no further file once 2 MB were read. Tables with
-    other column names than the most frequent ones, of equal ones the first, are left out. For text
-    files the keys of `[text]` are set in `p` first, and files of another form move from `p.names`
-    to `p.others`; if two or more of these have at least 8 rows of samples, `exclude` becomes `?`,
-    with a note. Damaged files are left out, also those with a line that has a wrong number of
-    cells; if there is only one file, such a line is left out instead. `p.is_cut` is set if only the
-    beginning of a file is read. The list is empty if files that are no text cannot be opened.
-    Raises DataError if all files are damaged, if the package that reads them is missing, or if no
-    text file can be opened, is a text and has a header that is certain.
-    """
-    contents = contents_of(p)
-    if p.description.format == "text":
-        propose_form(p, contents)
-    files: list[Table] = []
-    faults: list[Fault] = []
-    for name in [name for name in p.names if name in contents]:
+    is_text = p.description.format == "text"
+    files = list[Table]()
+    for name in propose_form(p, contents, faults) if is_text else contents:
         with caught(faults, name):
             files.append(table_in(p, contents[name], name))
-    if faults and not files:
+    if not files:
         raise DataError(f"Expected a table of samples, found none: {faults[0]}.")
-    heads = [tuple(table.columns) for table in files]
-    usual = max(heads, key=heads.count, default=())
-    return [table for table, head in zip(files, heads, strict=True) if head == usual]
+    usual = mode(tuple(table.columns) for table in files)
+    return [table for table in files if tuple(table.columns) == usual]
 
 
 def table_in(p: Proposal, content: bytes, name: str) -> Table:
     """Return the table of a file with this content; a text file gives all cells as texts.
 
-    An .npz file is read as one that holds all parts if the layout `npz` is stated; or, if no layout
-    is stated, if it is the only file and an array has lists of several items. Of a text or jsonl
-    file of more than 2 MB only the whole lines of the first 2 MB are read, and `p.is_cut` is set.
-    Raises DataError if the file is damaged, or if a line of a text file has a wrong number of
-    cells; but such lines of the only file are left out, unless all its lines are wrong.
+    An .npz file is read as one that holds all parts if it is the only file, or the layout `npz` is
+    stated; but not if another layout is. Of a text or jsonl file of more than 2 MB only the whole
+    lines of the first 2 MB are read, and `p.is_cut` is set. Lines of a text file with a wrong
+    number of cells are left out. Raises DataError if the file is damaged, or if all its lines have
+    a wrong number of cells.
     """
-    kind = p.description.format
-    if kind == "npz":
-        is_single = len(p.names) == 1 and "layout" not in p.stated
-        table = read_npz(content, name, has_all=True)
-        if p.stated.get("layout") == "npz" or (is_single and has_lists(table)):
-            return table
-    if kind in ("text", "jsonl") and len(content) > MOST_BYTES:
-        encoding = p.description.text.encoding
+    about = p.description
+    if about.format in ("text", "jsonl") and len(content) > MOST_BYTES:
+        encoding = about.text.encoding
         content = decode(content, encoding)[1].rpartition("\n")[0].encode(encoding) or content
         p.is_cut = True
-    if kind == "text":
-        table = read_text(content, name, p.description.text)
-        if len(p.names) > 1:
-            return table.whole()
+    if about.format == "text":
+        table = read_text(content, name, about.text)
         is_damaged = np.isin(table.lines, [error.line for error in table.damage])
         return replace(table.take(~is_damaged), damage=[])
-    return table_of(content, name, replace(p.description, layout="files"))
+    layout = p.stated.get("layout", "npz" if len(p.names) == 1 else "files")
+    return table_of(content, name, replace(about, layout=layout))
 
 
 def propose_tables(p: Proposal, files: Tables) -> None:
@@ -275,15 +237,13 @@ def propose_tables(p: Proposal, files: Tables) -> None:
     50,000 rows of each are used; `p.is_cut` is set if a file has more. `p.tables` becomes the
     tables of the parts, and `p.names` is emptied unless each file is one part. If the layout or
     `part.column` is `?`, nothing more is proposed: `p.tables` and `p.names` stay, and a note on
-    `channels` says why. Raises DataError if there is no table, no part, or only a table of results,
-    if the tables do not split as a stated layout says, or if a stated column, setting in `[time]`
-    or source of labels is wrong, and SettingError for a malformed `windows.trigger`.
+    `channels` says why. Raises DataError if there is no part, or only a table of results, if the
+    tables do not split as a stated layout says, or if a stated column, setting in `[time]` or
+    source of labels is wrong, and SettingError for a malformed `windows.trigger`.
     """
-    if not files:
-        raise DataError(f"Expected a table of samples in {listed(p.names)}, found none.")
     p.is_cut |= any(len(table.lines) > MOST_ROWS for table in files)
     files = [table.take(slice(0, MOST_ROWS)) for table in files]
-    if "layout" not in p.stated or p.description.layout == "long":
+    if "layout" not in p.stated:
         p.put("layout", layout_of(p, files))
     if UNKNOWN in (p.description.layout, *p.description.part.column):
         p.notes["channels"] = "they follow from layout and part.column"
@@ -291,6 +251,6 @@ def propose_tables(p: Proposal, files: Tables) -> None:
     p.tables = parts_of(p, files)
     if not p.tables:
         raise DataError(f"Expected recordings in {listed(p.names)}, found none.")
-    if p.description.layout != "files" or len(p.tables) != len(files):
+    if p.description.layout != "files":
         p.names = ()
     propose_roles(p)

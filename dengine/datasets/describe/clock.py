@@ -13,7 +13,7 @@ from ..description import UNKNOWN
 from ..read.clock import UNITS, check_steps, has_day, scale_of, times_of
 from ..read.files import caught
 from ..table import Table, UnreadableError
-from ..units import quantity_of, unit_in
+from ..units import quantity_of
 from .columns import Column, Proposal, Tables
 
 NAME = re.compile(
@@ -30,13 +30,13 @@ NAMED_UNIT = re.compile(
     r"(?i)(?P<ns>(?:^|[^a-z])n(?:ano)?_?se|nsecs?$)|(?P<ms>^milli|millis|^ms$|(?-i:[a-z]Ms$))"
     r"|(?P<us>micros)|(?P<s>(?:^|[^a-z])secs?(?:onds?)?$)"
 )
-# Counts since some day: their unit, the seconds from that day to 1970, and what they are called.
+# Counts since some day: their unit, and the seconds from that day to 1970.
 EPOCHS = (
-    *((unit, 0, f"{unit} since 1970") for unit in ("s", "ms", "us", "ns")),
-    ("d", 2_209_161_600, "days since 1900, as spreadsheets count them"),
-    ("0.0864 s", 2_209_161_600, "1e-6 days since 1900, as WinCC counts them"),
-    ("0.1 us", 11_644_473_600, "0.1 us since 1601"),
-    ("0.1 us", 62_135_596_800, "0.1 us since the year 1"),
+    *((unit, 0) for unit in ("s", "ms", "us", "ns")),
+    ("d", 2_209_161_600),  # since 1900, as spreadsheets count days
+    ("0.0864 s", 2_209_161_600),  # 1e-6 days since 1900, as WinCC counts them
+    ("0.1 us", 11_644_473_600),  # since 1601
+    ("0.1 us", 62_135_596_800),  # since the year 1
 )
 YEARS = (946_684_800, 2_524_608_000)  # seconds since 1970 of the years 2000 to 2050
 # Steps between these are taken for seconds: larger ones may be milliseconds of a rate up to 50 kHz,
@@ -53,30 +53,27 @@ def propose_clock(p: Proposal) -> None:
     """Find the column of times and its form, and set `time.column` and `time.format` in `p`.
 
     `time.column` is set to `?`, with a note, if several columns may tell the time or a part of it,
-    like a date that is the same in all rows of a recording; such a date is not looked for beside a
-    clock whose cells tell the day. It is `?`, too, if no column may (`is_clock`), but the columns
-    have no names, or one is named `s`, which may be seconds or the stroke. Otherwise, if no column
-    may, it stays empty, and a note says that the rate is unknown, as it does if none of the stated
-    columns is there. Stated columns are kept; only their forms are found. Raises SettingError for a
-    malformed `windows.trigger`.
+    like a date or whole seconds that are the same in all rows of a recording; these are not looked
+    for beside a clock whose cells tell the day. It is `?`, too, if no column may (`is_clock`), but
+    the columns have no names, or one is named `s`, which may be seconds or the stroke. Otherwise,
+    if no column may, it stays empty. Stated columns are kept; only their forms are found. Raises
+    SettingError for a malformed `windows.trigger`.
     """
-    stated = p.description.time.column
     clocks = [column for column in p.columns.values() if is_clock(column)]
-    if "time.column" in p.stated:
-        clocks = [p.columns[name] for name in stated if name in p.columns]
-    is_open = clocks or "c0" in p.description.text.names or "s" in p.columns  # may be the stroke
-    every = p.columns.values() if is_open else ()
+    if is_stated := "time.column" in p.stated:
+        clocks = [p.columns[name] for name in p.description.time.column]
     has_days = any(has_day(form) for column in clocks for form in column.forms)
-    coarse = [] if has_days else [c for c in p.unused if c.forms or is_coarse(c)]
-    names = [c.name for c in every if c in clocks or c in coarse or not clocks]
-    if clocks and (stated or len(names) == 1):
+    coarse = [c for c in p.unused if c.forms or (NAME.search(c.name) and len({*c.fixed}) > 1)]
+    names = [c.name for c in p.columns.values() if c in clocks or (c in coarse and not has_days)]
+    if not clocks:
+        has_no_names = "c0" in p.description.text.names or "s" in p.columns  # may be the stroke
+        names = [*p.columns] if has_no_names else []
+    if clocks and (is_stated or len(names) == 1):
         p.put("time.column", [column.name for column in clocks])
         p.put("time.format", [form_of(column, p, len(clocks) == 1) for column in clocks])
-    elif names and "time.column" not in p.stated:
+    elif names:
         text = f"of {listed(names)}: one, several that are added (a date, a time, ms), or []: none"
         p.put("time.column", UNKNOWN, text)
-    else:
-        p.notes["time.rate_hz"] = "unknown, for no clock was found; state it if you know it"
 
 
 def is_clock(column: Column) -> bool:
@@ -84,41 +81,25 @@ def is_clock(column: Column) -> bool:
 
     Dates and times of day may if they change within a recording. So may a column that is named like
     a clock (`time`, `stamp`, `t`, ...), if not all its cells are numbers and they change within a
-    recording, or if all are numbers that rise (`is_rising`) and it has no unit of another quantity,
-    like N.
+    recording, or if all are numbers that rise and it has no unit of another quantity, like N. They
+    may fall in at most 10 % of the steps, like a counter that begins again.
     """
     is_named = NAME.search(column.name) is not None
     if column.forms or (is_named and column.odd):
         return not column.fixed
-    quantity = quantity_of(column.unit or unit_in(column.name))
-    return is_named and not quantity and is_rising(column)
-
-
-def is_coarse(column: Column) -> bool:
-    """Return whether a column is named like a clock and changes only from recording to recording.
-
-    Seconds beside a column of nanoseconds may do so.
-    """
-    return NAME.search(column.name) is not None and len({*column.fixed}) > 1
-
-
-def is_rising(column: Column) -> bool:
-    """Return whether the cells are numbers that rise, and fall in at most 10 % of the steps.
-
-    A counter that begins again may fall so.
-    """
-    steps = column.steps
-    return bool((steps > 0).any() and (steps < 0).sum() <= FEW * len(steps))
+    if not is_named or quantity_of(column.unit):
+        return False
+    return bool((column.steps > 0).any() and (column.steps < 0).sum() <= FEW * len(column.steps))
 
 
 def form_of(column: Column, p: Proposal, is_alone: bool) -> str:
     """Return the unit or the form of a column of times; `?` if none is certain.
 
     The form of dates or times of day comes first, then the unit that the file states, the one in
-    the column's name, and what the size of the numbers proves. A note on `time.format` in `p` says
-    why it is `?`, or which size proves the unit. If several forms of dates fit, so that day and
-    month can be confused, the form is `?`; but if another column tells a part of the time, too, and
-    all recordings have one and the same date, it is the first of these forms.
+    the column's name, like `ms` of `t [ms]`, `t in 0.1 ms` or `millis`, and what the size of the
+    numbers proves. A note on `time.format` in `p` says why it is `?`. If several forms of dates
+    fit, so that day and month can be confused, the form is `?`; but if another column tells a part
+    of the time, too, and all recordings have one and the same date, it is the first of these forms.
 
     is_alone : whether no other column tells a part of the time.
     """
@@ -126,54 +107,51 @@ def form_of(column: Column, p: Proposal, is_alone: bool) -> str:
     if len(forms) > 1 and (is_alone or len({*column.fixed}) != 1):
         p.notes["time.format"] = f"{listed(forms)}: the cells prove neither"
         return UNKNOWN
-    for unit in (*forms, column.unit, _unit_in(column.name)):
+    units = [*forms, column.unit]
+    if match := UNIT_IN_NAME.search(column.name):
+        units.append(match[1].replace(",", "."))
+    elif match := NAMED_UNIT.search(column.name):
+        units.append(str(match.lastgroup))
+    for unit in units:
         unit = unit.replace("sec", "s")
         if unit in forms or unit.lstrip("0123456789. ") in UNITS:
             return unit
-    unit, p.notes["time.format"] = _unit_by_size(column)
-    return unit
+    return _unit_by_size(column, p)
 
 
-def _unit_in(name: str) -> str:
-    """Return the unit of time that a column's name has, `ms` for `t [ms]` or `millis`; "" for none.
-
-    It may have a number, like `0.1 ms`.
-    """
-    if match := UNIT_IN_NAME.search(name):
-        return match[1].replace(",", ".")
-    match = NAMED_UNIT.search(name)
-    return (match and match.lastgroup) or ""
-
-
-def _unit_by_size(column: Column) -> tuple[str, str]:
-    """Return the unit of time that the numbers in a column prove, and a note on it.
+def _unit_by_size(column: Column, p: Proposal) -> str:
+    """Return the unit of time that the numbers in a column prove; `?`, with a note, if none.
 
     A unit is proved if with it the first number is a time in the years 2000 to 2050, counted from
     1970 or from another day that clocks use, and the median of the steps above 0 gives a rate of
     1 Hz to 1 MHz; the first in `EPOCHS` counts. If none is, and this step is 0.0002 to 0.019, the
-    unit is s. Otherwise it is `?`, and the note lists the possible units. It is `?`, too, if the
-    column has no numbers that rise; the note then asks for the form of its cells.
+    unit is s. Otherwise it is `?`, and the note on `time.format` in `p` lists the possible units.
+    It is `?`, too, if the column has no numbers that rise; the note then asks for the form of its
+    cells.
     """
     rising = column.steps[column.steps > 0]
     if not len(rising):
         odd = listed([*column.odd][:3])
-        return UNKNOWN, f"no form of times that is known fits {odd}: state it, or text.drop"
+        text = f"no form of times that is known fits {odd}: state it, or text.drop"
+        p.notes["time.format"] = text
+        return UNKNOWN
     first = float(column.numbers[0][0])
     step = float(np.median(rising))
-    for unit, zero, title in EPOCHS:
+    for unit, zero in EPOCHS:
         scale = scale_of(unit)
         if YEARS[0] <= first * scale - zero <= YEARS[1] and is_rate(step * scale):
-            return unit, f"{title}, by the size of the numbers"
+            return unit
     if SECONDS[0] <= step <= SECONDS[1]:
-        return "s", f"seconds, for steps of {step:.6g}; the unit is not stated"
+        return "s"
     steps = {unit: step * UNITS[unit] for unit in ("s", "ms", "us", "ns", "min")}
     rates = ", ".join(f"{unit} ({1 / s:.6g} Hz)" for unit, s in steps.items() if is_rate(s))
-    return UNKNOWN, f"steps of {step:.6g}, the unit is not stated: {rates}"
+    p.notes["time.format"] = f"steps of {step:.6g}, the unit is not stated: {rates}"
+    return UNKNOWN
 
 
 def is_rate(step: float) -> bool:
     """Return whether a step in seconds is of a rate that forces are recorded at, 1 Hz to 1 MHz."""
-    return step > 0 and LEAST_RATE_HZ <= 1 / step <= MOST_RATE_HZ
+    return 1 / MOST_RATE_HZ <= step <= 1 / LEAST_RATE_HZ
 
 
 def propose_rate(p: Proposal, tables: Tables) -> None:

@@ -7,6 +7,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
+from statistics import mode
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,7 @@ from ..description import Clock, Description, TextForm
 from ..read.clock import ISO, times_of
 from ..read.split import column_kind
 from ..table import Table
-from ..units import bare
+from ..units import bare, unit_in
 
 DAY = "%Y-%m-%d"
 DAYS = ("%d.%m.%Y", "%Y/%m/%d", "%m/%d/%Y", "%d/%m/%Y", "%d.%m.%y", "%d-%b-%y", "%d-%b-%Y")
@@ -29,6 +30,7 @@ FORMS = (DAY, ISO, *DAYS, *TIMES, "%M:%S.%f", *ZONED, *MOMENTS)
 LIKE_A_TIME = re.compile(r"\d+[:\-./T](\d+|[A-Za-z]{3})[:\-./T]\d|\d+:\d+\.\d|\d{8}T\d{6}")
 LEAST_RUN = 8  # rows of a part
 MOST_WORDS = 12  # that are told apart, as labels
+LOST = ("nan", "null", "none", "n/a", "na", "-", "--", "---", "#n/a", "")
 MOST_CELLS = 20  # of a recording whose form of times is looked at
 # A number with any decimal mark and any mark of groups.
 NUMBER = re.compile(
@@ -67,6 +69,11 @@ class Column:
         return Counter({w: n for w, n in self.counts.items() if not NUMBER.fullmatch(w)})
 
     @cached_property
+    def strange(self) -> Counter[str]:
+        """How often each word comes that is no number and does not mean a lost sample (`LOST`)."""
+        return Counter({w: n for w, n in self.odd.items() if w.lower() not in LOST})
+
+    @cached_property
     def fixed(self) -> list[str]:
         """The word of each recording; empty if one has several words or no rows."""
         is_fixed = all(len(words) and (words == words[0]).all() for words in self.words)
@@ -76,14 +83,13 @@ class Column:
     def numbers(self) -> list[Floats]:
         """The numbers of each recording whose cells are all numbers, as `[text]` writes them.
 
-        A word of `text.missing` is NaN. Recordings with other cells are left out; if they are more
-        than 10 %, the list is empty.
+        A word of `text.missing` is NaN. Recordings with other cells are left out.
         """
         numbers = list[Floats]()
         for table in self.tables:
             with suppress(DataError):
                 numbers.append(table.numbers(self.name, self.form))
-        return numbers if len(numbers) >= 0.9 * len(self.tables) else []
+        return numbers
 
     @cached_property
     def steps(self) -> Floats:
@@ -92,9 +98,9 @@ class Column:
 
     @cached_property
     def unit(self) -> str:
-        """The unit that most files state for the column; "" if more state none than any one."""
-        units = Counter(bare(table.units.get(self.name, "")) for table in self.tables)
-        return units.most_common(1)[0][0]
+        """The unit that most files state for the column, or else the one in its name, or ""."""
+        unit = mode(bare(table.units.get(self.name, "")) for table in self.tables)
+        return unit or unit_in(re.sub(r"\.\d+$|\*$", "", self.name))
 
     @cached_property
     def forms(self) -> list[str]:
@@ -108,7 +114,7 @@ class Column:
         if self.tables[0].columns[self.name].dtype.kind == "M":
             return [ISO]
         cells = {word for words in self.words for word in (*words[:MOST_CELLS], *words[-1:])}
-        if not cells or not all(map(LIKE_A_TIME.match, cells)):
+        if not all(map(LIKE_A_TIME.match, cells)):
             return []
         table = Table(self.name, {self.name: np.array(sorted(cells), dtype=object)}, [])
         forms = list[str]()
@@ -121,8 +127,10 @@ class Column:
 
 def columns_of(tables: Tables, form: TextForm) -> dict[str, Column]:
     """Return the columns of the first table by their names, each with the tables that have it."""
-    names = tables[0].columns if tables else ()
-    return {name: Column(name, [t for t in tables if name in t.columns], form) for name in names}
+    return {
+        name: Column(name, [table for table in tables if name in table.columns], form)
+        for name in tables[0].columns
+    }
 
 
 @dataclass

@@ -10,13 +10,15 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from itertools import permutations
-from typing import Any, Literal
+from typing import Any
 
 from ...errors import DataError
-from ..description import UNKNOWN, LabelSource, PartSource
+from ..dataset import Fault
+from ..description import SOURCES, UNKNOWN, Description, LabelSource, PartSource
+from ..read.files import caught
 from ..read.places import listing_table, part_of, read_labels, without_suffix
-from ..table import Table, UnreadableError
-from .columns import MOST_WORDS, Column, Proposal, Tables, counts_of
+from ..table import Table
+from .columns import MOST_WORDS, Proposal, Tables, counts_of
 
 GOOD = (
     *("ok", "pass", "passed", "good", "success", "gut", "true", "i.o.", "i.o", "i_o", "io"),
@@ -57,10 +59,13 @@ PLACES = (  # of any words: folders, and the words of a file's name, counted fro
     "([^-_ /]+)(?:[-_ ][^-_ /]*){3}$",
     "(?:^|/)([^-_ /]+)[^/]*$",
 )
-NO_LABEL = "none was found that is certain: state label.column, path, line or listing"
-KINDS = ("listing", "key", "column", "path", "line")
+NO_LABEL = (
+    "none was found that is certain: state label.column, path, line or listing; label.at is `last` "
+    "if only the last row has the label"
+)
 Names = Iterable[str]
 Words = Mapping[str, str]  # by recording
+Meanings = Mapping[str, int | None]  # by recording: 1 good, 0 bad, None unchecked
 
 
 def with_meanings(source: LabelSource, words: Names) -> LabelSource:
@@ -88,10 +93,10 @@ def with_meanings(source: LabelSource, words: Names) -> LabelSource:
     return replace(source, **about)
 
 
-def is_plain(source: LabelSource) -> bool:
-    """Return whether a source of labels has words for good or bad, and none of these is `?`."""
-    words = source.good + source.bad
-    return bool(words) and UNKNOWN not in words
+def has_meaning(source: LabelSource, words: Names) -> bool:
+    """Return whether any of the words is known to mean good or bad (see `with_meanings`)."""
+    source = with_meanings(source, words)
+    return bool({*source.good, *source.bad} - {UNKNOWN})
 
 
 def in_paths(paths: Names) -> list[str]:
@@ -106,8 +111,8 @@ def in_paths(paths: Names) -> list[str]:
     patterns = []
     for pattern in () if any(map(NEGATED.search, stems)) else PATHS:
         words = {m[1] for stem in stems if (m := re.search(f"(?i){pattern}", stem))}
-        used = sorted(map(re.escape, words), key=lambda text: (-len(text), text))
-        patterns += [pattern.replace(WORD, "|".join(used))] if words else []
+        used = "|".join(sorted(map(re.escape, words)))
+        patterns += [pattern.replace(WORD, used)] if words else []
     return patterns
 
 
@@ -127,38 +132,14 @@ def may_be_labels(source: LabelSource, words: Names) -> bool:
 
     `words` has the word of each recording, or of each row of a listing. There must be 2 to 12
     different ones, and on average at least two recordings for each. If the source is named like a
-    verdict (`is_named_like_verdict`), the average does not matter, and one word is enough if `good`
-    or `bad`, after `with_meanings`, has a word.
+    verdict (`is_named_like_verdict`), the average does not matter, and one word is enough if it has
+    a meaning.
     """
     words = [*words]
     n = len({*words})
-    about = with_meanings(source, words)
-    is_known = bool({*about.good, *about.bad} - {UNKNOWN})
-    is_named = is_named_like_verdict(source)
-    least, most = (2 - is_known, MOST_WORDS) if is_named else (2, len(words) / 2)
-    return least <= n <= min(most, MOST_WORDS)
-
-
-def row_of(column: Column) -> Literal["", "same", "last", "first"]:
-    """Return which row of a recording has the label, if this column holds it; "" if it cannot.
-
-    "same": each recording has one word in all rows. "last" and "first", tried in this order: this
-    row has the label, and all others have the same word or one that means that the part is not
-    checked, like "pending" or "".
-    """
-    if column.fixed:
-        return "same"
-    rows: Sequence[tuple[Literal["last", "first"], int]] = (("last", -1), ("first", 0))
-    for row, i in rows:
-        above = {word.lower() for words in column.words for word in {*words} - {*words[i:][:1]}}
-        if above <= {*UNCHECKED}:
-            return row
-    return ""
-
-
-def is_verdict(column: Column) -> bool:
-    """Return whether a column has the name of a verdict, and one row of a recording its label."""
-    return NAME.fullmatch(column.name) is not None and row_of(column) != ""
+    if not is_named_like_verdict(source):
+        return 2 <= n <= min(len(words) / 2, MOST_WORDS)
+    return 2 - has_meaning(source, words) <= n <= MOST_WORDS
 
 
 def lines_of(p: Proposal) -> list[str]:
@@ -186,21 +167,17 @@ def part_words(source: PartSource, tables: Tables) -> Words:
 
 
 def sources_of(p: Proposal, paths: Names) -> Iterator[LabelSource]:
-    """Yield the sources that may hold the labels; if the user stated a source, only that.
+    """Yield the sources that may hold the labels.
 
     They come in this order: pairs of columns of listings among `p.others`, of which one may be the
     key, since it has more different words than half of its rows, and the other may hold labels;
     regular expressions for the paths (if a file or a column is a part), of words like "ok" in them
-    and of any words at fixed places; columns without another use that may have the label in all
-    rows, the last or the first; and lines above the header. A file that cannot be read as a listing
-    is skipped. A stated `label.topic` alone is no stated source here.
+    and of any words at fixed places; columns without another use that have one word in all rows of
+    a recording; and lines above the header. A file that cannot be read as a listing is skipped.
 
     paths : the path of each recording.
     """
     label = p.description.label
-    if any(getattr(label, kind) for kind in KINDS):
-        yield label
-        return
     for name in p.others:
         with suppress(DataError, ValueError):
             table = listing_table(p.base / name, p.description.text)
@@ -211,9 +188,7 @@ def sources_of(p: Proposal, paths: Names) -> Iterator[LabelSource]:
                         yield source
     if p.description.layout in ("files", "columns"):
         yield from (replace(label, path=path) for path in (*in_paths(paths), *PLACES))
-    for unused in p.unused:
-        if row := row_of(unused):
-            yield replace(label, column=unused.name, at=row)
+    yield from (replace(label, column=column.name) for column in p.unused if column.fixed)
     yield from (replace(label, line=line) for line in lines_of(p))
 
 
@@ -221,22 +196,19 @@ def words_of(p: Proposal, source: LabelSource, tables: Tables, parts: Words) -> 
     """Return the word of each recording that has one in a source, by its `Table.source`.
 
     `tables` has the table of each recording, and `parts` their part numbers. If a listing has
-    several rows for a recording, it is the word of the first. For the stated source, DataError is
-    raised if no recording has a word, its listing cannot be read, or its `path` is no regular
-    expression with one group. Any other source then gives an empty mapping.
+    several rows for a recording, it is the word of the first. If no recording has a word, its
+    listing cannot be read, or its `path` is no regular expression with one group, DataError is
+    raised for the stated source; any other then gives an empty mapping.
     """
     words = dict[str, str]()
-    is_stated = source == p.description.label
-    why = ""
-    with suppress(*([] if is_stated else [DataError])):
+    faults = list[Fault]()
+    with caught(faults, source.listing):
         reader = read_labels(p.base, source, p.description.text)
         for table in tables:
-            try:
+            with caught(faults, table.source):
                 words[table.source] = reader.words(table, parts.get(table.source, ""))[0]
-            except UnreadableError as error:
-                why = why or str(error).rstrip(".")
-    if is_stated and not words:
-        raise DataError(f"Expected words where [label] says they stand, found none. {why}.")
+    if source == p.description.label and not words:
+        raise DataError(f"Expected words where [label] says they stand, found none. {faults[0]}.")
     return words
 
 
@@ -245,48 +217,46 @@ def title_of(source: LabelSource, words: Words) -> str:
 
     In brackets follows how often each word comes. `words` has the word of each recording.
     """
-    values = {kind: getattr(source, kind) for kind in (*KINDS, "at")}
-    stated = [
-        f"label.{kind}={value}" for kind, value in values.items() if value not in ("", "same")
-    ]
-    return f"{' '.join(stated)} ({counts_of(words.values())})"
+    stated = Description(label=source).to_dict()["label"]
+    keys = [f"label.{key}={value}" for key, value in stated.items() if isinstance(value, str)]
+    return f"{' '.join(keys)} ({counts_of(words.values())})"
 
 
-def count_sources(p: Proposal) -> dict[LabelSource, Words]:
+def count_sources(p: Proposal, stated: Sequence[LabelSource]) -> dict[LabelSource, Words]:
     """Return the possible sources of labels, each with the words that it has, by recording.
 
     If the user stated a source, only that one is returned. Otherwise these are the sources that
-    have few different words (`may_be_labels`), and words for more than half of the recordings. A
-    source with the same words as an earlier one counts only if it is named like a verdict. For
-    listings and paths all recordings count, since their names are enough; for columns and lines
-    only those whose tables were read. The words are sorted into good, bad and unchecked as
-    `with_meanings` does. Raises DataError if the stated source has no words or cannot be read, and
-    SettingError for a malformed `windows.trigger`.
+    have few different words (`may_be_labels`), and more of them than half of `p.tables`. A source
+    with the same words as an earlier one counts only if it is named like a verdict. For listings
+    and paths all recordings count, since their names are enough; for columns and lines only those
+    whose tables were read. The words are sorted into good, bad and unchecked as `with_meanings`
+    does. Raises DataError if the stated source has no words or cannot be read, and SettingError for
+    a malformed `windows.trigger`.
     """
     looked_at = {table.source for table in p.tables}
     others = [Table(name, {}, [], path=name) for name in p.names if name not in looked_at]
     tables = [*p.tables, *others]
     parts = part_words(p.description.part, tables)
     counted = dict[LabelSource, Words]()
-    for source in sources_of(p, [table.path for table in tables]):
+    for source in stated or sources_of(p, [table.path for table in tables]):
         words = words_of(p, source, tables, parts)
-        n = len(tables if source.listing or source.path else p.tables)
         is_new = words not in counted.values() or is_named_like_verdict(source)
-        is_likely = len(words) > n / 2 and is_new and may_be_labels(source, words.values())
-        if is_likely or source == p.description.label:
+        is_common = len(words) > len(p.tables) / 2
+        if stated or (is_new and is_common and may_be_labels(source, words.values())):
             counted[with_meanings(source, words.values())] = words
     return counted
 
 
-def sides_of(source: LabelSource, words: Words) -> dict[str, int]:
-    """Return, by recording, 1 for a word for good, -1 for bad and 0 for unchecked.
+def meanings_of(source: LabelSource, words: Words) -> Meanings:
+    """Return, by recording, 1 for a word for good, 0 for bad and None for unchecked.
 
     The source has the lists of these words, and `words` the word of each recording. The dict is
     empty if a word is in no list, or if none is for good or bad.
     """
-    is_known = {*source.good, *source.bad, *source.unchecked}.issuperset(words.values())
-    sides = {name: (word in source.good) - (word in source.bad) for name, word in words.items()}
-    return sides if is_known and any(sides.values()) else {}
+    if not {*words.values()} <= source.meanings.keys():
+        return {}
+    meanings = {name: source.meanings[word] for name, word in words.items()}
+    return meanings if {*meanings.values()} - {None} else {}
 
 
 def propose_label(p: Proposal) -> None:
@@ -298,53 +268,40 @@ def propose_label(p: Proposal) -> None:
     none is known, but only one is named like a verdict, that becomes the label, with `?` for words
     whose meaning is open. Otherwise `label.column` is `?`, with a note that lists all sources.
     Further known sources that have a word for each recording of the label become checks, unless
-    checks are stated; notes count the words. Raises DataError if a stated source has no words or
-    cannot be read, and SettingError for a malformed `windows.trigger`.
+    checks are stated; a note counts the words of the label, also on `label.good` and `label.bad` if
+    these are `?`. Raises DataError if a stated source has no words or cannot be read, and
+    SettingError for a malformed `windows.trigger`.
     """
-    counted = count_sources(p)
-    sides = {source: sides_of(source, words) for source, words in counted.items()}
-    is_stated = any(getattr(p.description.label, kind) for kind in KINDS)
-    named = [source for source in counted if is_stated or is_named_like_verdict(source)]
-    certain = [source for source in named if sides[source]]
-    doubt = _disagreement([sides[source] for source in [*certain[:1], *counted]])
-    several = len({*sides[certain[0]].values()} - {0}) > 1 if certain else len(named) == 1
-    if doubt or not (several or (certain and len(counted) == len(certain))):
+    label = p.description.label
+    stated = [label] if any(getattr(label, kind) for kind in SOURCES) else []
+    counted = count_sources(p, stated)
+    meanings = {source: meanings_of(source, words) for source, words in counted.items()}
+    named = [source for source in counted if stated or is_named_like_verdict(source)]
+    certain = [source for source in named if meanings[source]]
+    is_clear = len(named) == 1
+    doubt = NO_LABEL
+    if certain:
+        first = meanings[certain[0]]
+        n_odd = max(_count_contradictions(first, other) for other in meanings.values())
+        has_both = {0, 1} <= {*first.values()}
+        is_clear = n_odd == 0 and (has_both or len(certain) == len(counted))
+        if n_odd:
+            doubt = f"two of these disagree on {n_odd:,} of {len(first):,} recordings"
+    if not is_clear:
         titles = map(title_of, counted, counted.values())
-        p.put("label.column", UNKNOWN, "; ".join([*titles, doubt or NO_LABEL]))
+        p.put("label.column", UNKNOWN, "; ".join([*titles, doubt]))
         return
-    best, *others = certain or named
-    words = counted[best]
-    checks = tuple(source for source in others if counted[source].keys() >= words.keys())
-    p.description = replace(p.description, label=best, check=p.description.check or checks)
-    _note_words(
-        p, best, words, [title_of(other, counted[other]) for other in named if other != best]
-    )
+    label = [*certain, *named][0]
+    words = counted[label]
+    checks = tuple(source for source in certain[1:] if counted[source].keys() >= words.keys())
+    p.description = replace(p.description, label=label, check=p.description.check or checks)
+    place = next(kind for kind in SOURCES if getattr(label, kind))
+    unclear = [key for key in ("good", "bad") if UNKNOWN in getattr(label, key)]
+    note = f"{counts_of(words.values())}, over {len(words):,} recordings"
+    p.notes[f"label.{place}"] = note
+    p.notes |= {f"label.{key}": f"which of the words? {note}" for key in unclear}
 
 
-def _note_words(p: Proposal, label: LabelSource, words: Words, others: Names) -> None:
-    """Note in `p.notes` which words stand in the source of the label, and how often.
-
-    `label` is this source. The words are the texts that stand for a label, like "ok"; `words` has
-    one for each recording. `others` describes the other possible sources, which the same note, on
-    `label.column` or the like, lists. If `label.good` or `label.bad` is `?`, notes on both ask
-    which of the words they are.
-    """
-    counts = counts_of(words.values())
-    if UNKNOWN in label.good + label.bad:
-        p.notes |= dict.fromkeys(("label.good", "label.bad"), f"which of the words? {counts}")
-    kind = next(kind for kind in KINDS if getattr(label, kind))
-    p.notes[f"label.{kind}"] = "; ".join([f"{counts}, over {len(words):,} recordings", *others])
-
-
-def _disagreement(sides: Sequence[Mapping[str, int]]) -> str:
-    """Return a sentence if a source of labels contradicts the first one; "" if none does.
-
-    It has the number of recordings that are good by one and bad by the other. Only the first source
-    that contradicts is reported.
-
-    sides : for each source 1 for good, -1 for bad and 0 for unchecked, by recording.
-    """
-    for other in sides[1:]:
-        if n := sum(side * other.get(name, 0) < 0 for name, side in sides[0].items()):
-            return f"two of these disagree on {n:,} of {len(sides[0]):,} recordings"
-    return ""
+def _count_contradictions(meanings: Meanings, others: Meanings) -> int:
+    """Return how many recordings are good by one of two sources of labels and bad by the other."""
+    return sum({label, others.get(name)} == {0, 1} for name, label in meanings.items())

@@ -31,11 +31,11 @@ def layout_of(p: Proposal, files: Tables) -> str:
     Several JSON or .ts files, of which the first has one row, are `files`. Lists in the first row
     of the first table, or 20 or more columns like `x0`, `x1`, make it `wide`, or `npz` for an .npz
     file. It is `long` if a column of the first table may tell the parts apart (`may_tell_parts`),
-    or if the stated `part.column` has several words; unless it is stated, `part.column` is then set
-    in `p` to the only such column with a name like that of a part's number and no word in two
-    files, or to `?` with a note. Several tables are `files`. A single one gives `?`, with a note on
-    what to state, or DataError if it is a table of results: one row for each part, with its label,
-    and no samples. Raises UnreadableError if cells of columns that are looked at are lists.
+    or if a file has several words of a stated `part.column`; unless it is stated, `part.column` is
+    then set in `p` to the only such column with a name like that of a part's number and no word in
+    two files, or to `?` with a note. Several tables are `files`. A single one gives `?`, with a
+    note on what to state, or DataError if it is a table of results: one row for each part, with its
+    label, and no samples. Raises UnreadableError if cells of columns that are looked at are lists.
     """
     kind = p.description.format
     first = files[0]
@@ -45,18 +45,13 @@ def layout_of(p: Proposal, files: Tables) -> str:
         return "npz" if kind == "npz" else "wide"
     columns = columns_of(files, TextForm())
     runs = [name for name, column in columns.items() if may_tell_parts(column)]
-    stated = p.description.part.column
-    if runs or any(len(columns[name].counts) > 1 for name in stated if name in columns):
-        named = [*filter(PART_NAME.search, columns)]
-        likely = [
-            name
-            for name in runs
-            if name in named and words_in(columns[name]) == len(columns[name].counts)
-        ]
+    stated = [columns[name] for name in p.description.part.column if name in columns]
+    if runs or any(words_in(column) > len(files) for column in stated):
+        unique = [name for name in runs if words_in(columns[name]) == len(columns[name].counts)]
+        likely = [*filter(PART_NAME.search, unique)]
         long = [name for name, column in columns.items() if has_long_runs(column)]
+        named = filter(PART_NAME.search, columns)
         note = f"one of {listed(dict.fromkeys([*named, *long]))}, or several"
-        if len(likely) < len({*runs} & {*named}):
-            note = f"{note}; the same number stands in several files"
         p.put("part.column", *(likely if len(likely) == 1 else (UNKNOWN, note)))
         return "long"
     if len(files) > 1:
@@ -119,15 +114,14 @@ def has_lists(table: Table) -> bool:
 def _refuse_results(columns: Iterable[Column]) -> None:
     """Raise DataError for a table of results: a row for each part, with its label, but no samples.
 
-    `columns` are those of a single table. One shows this if it has known words for good and for
+    `columns` are those of a single table. One shows this if it has a known word for good or for
     bad, maybe among other words, and somewhere between two changes one word stands in fewer than 8
     successive rows.
     """
     for column in columns:
         edges = np.flatnonzero(column.words[0][1:] != column.words[0][:-1])
         is_short = min(np.diff(edges), default=LEAST_RUN) < LEAST_RUN
-        source = labels.with_meanings(LabelSource(), column.counts if is_short else ())
-        if labels.is_plain(source) and source.good and source.bad:
+        if is_short and labels.has_meaning(LabelSource(), column.counts):
             raise DataError(
                 f"Expected the samples of each part in {column.tables[0].source}, got a row for "
                 f"each result, with its verdict in {column.name}, and no curve; if the rows of "
@@ -149,7 +143,7 @@ def parts_of(p: Proposal, files: Tables) -> list[Table]:
     if layout == "columns":
         clock = [*filter(CLOCK_NAME.search, files[0].columns)]
         description = description.with_values({"time.column": clock})
-    if layout in ("wide", "columns") and not description.channels:
+    if not description.channels:
         description = replace(description, channels=dict.fromkeys(patterns, Channel()))
     parts = list[Table]()
     for table in files:

@@ -24,8 +24,8 @@ def propose_order(p: Proposal) -> None:
     """Set `order` in `p` to `?`, with a note, if the file names, sorted, need not be the order.
 
     That is so if a file name stands in several folders, once the text of `label.path` is left out;
-    if each file name has a date, and one is written with the day, the month or AM and PM so that
-    names do not sort by it, or the names are not in the order of the dates; or if a column of
+    if a file name has a date that is written with the day, the month or AM and PM so that names do
+    not sort by it, or the names are not in the order of their dates; or if a column of
     `p.unused` has one date or time per recording, and these, as `natural_key` sorts texts, are in
     another order. An `order` that the user stated stays.
     """
@@ -35,8 +35,7 @@ def propose_order(p: Proposal) -> None:
         p.put("order", UNKNOWN, "name: by file name, or path: folder by folder")
     matches = [*filter(None, map(DATE.search, names))]
     dates = [match.string[match.start() :] for match in matches]
-    is_odd = any(match["odd"] for match in matches) or dates != sorted(dates, key=natural_key)
-    if is_odd and len(dates) == len(names):
+    if any(match["odd"] for match in matches) or dates != sorted(dates, key=natural_key):
         p.put("order", UNKNOWN, ODD)
     for column in p.unused:
         ranks = [*map(natural_key, column.fixed)] if column.forms else []

@@ -3,7 +3,6 @@ nothing.
 """
 
 import re
-from collections import Counter
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import replace
@@ -11,26 +10,23 @@ from dataclasses import replace
 import numpy as np
 
 from ...errors import DataError, listed
-from ..description import ANY, UNKNOWN, Channel, LabelSource, PartSource, RowWords, expect_one_of
+from ..description import ANY, UNKNOWN, LabelSource, PartSource, RowWords, expect_one_of
 from ..read.files import natural_key
 from ..read.recordings import kept_rows
 from ..read.split import match_numbered
-from ..table import Table
-from ..units import quantity_of, unit_in
+from ..units import quantity_of
 from .clock import NAME as CLOCK_NAME
 from .clock import is_clock, propose_clock, propose_rate
 from .columns import MOST_WORDS, Column, Proposal, columns_of, counts_of
-from .labels import is_verdict, lines_of, part_words, propose_label, with_meanings
+from .labels import NAME, has_meaning, lines_of, part_words, propose_label
 from .layout import PART_NAME
 from .order import propose_order
 
-MOST_FREQUENT = 0.9  # of the rows, if the others are of another signal
 SPARSE = 0.1
 STRANGE = 0.01
 PART_LINE = re.compile(r"(?i)serial|barcode|dmc|part ?(no|num|id)|teilenummer|werkst.ck|serien")
 QUALIFIER_NAME = re.compile(r"(?i)status|valid|quality|flag|error|state")
 COUNTER_NAME = re.compile(r"(?i)(index|row|sample|n|i|punkt|point|count|nr|no|line)s?")
-LOST = ("nan", "null", "none", "n/a", "na", "-", "--", "---", "#n/a", "")
 LOADS = ("force", "torque")
 SET_VALUE = re.compile(r"(?i)(^|[^a-z])(set|soll|max|min|limit)")
 FORCES = (
@@ -58,8 +54,7 @@ def propose_roles(p: Proposal) -> None:
         expect_one_of(p.columns, name, "the columns")
     qualify_rows(p)
     propose_clock(p)
-    if p.description.layout not in ("long", "columns"):
-        propose_part(p)
+    propose_part(p)
     propose_label(p)
     propose_channels(p, _units(p))
     find_lost(p)
@@ -68,32 +63,29 @@ def propose_roles(p: Proposal) -> None:
         p.put("traces.samples", UNKNOWN, "it follows from rows")
     else:
         if clock.column and UNKNOWN not in clock.column + clock.format:
-            propose_rate(p, [samples_only(p, table) for table in p.tables])
+            propose_rate(p, p.tables)
         propose_lengths(p)
     if p.description.order == "name" and UNKNOWN not in clock.column:
         propose_order(p)
     list_others(p)
 
 
-def samples_only(p: Proposal, table: Table) -> Table:
-    """Return a table of the rows that are samples, by the columns of `[rows]` that have no `?`.
-
-    If one of these columns is missing, or has a word without a meaning, all rows are returned.
-    """
-    rows = {name: rows for name, rows in p.description.rows.items() if UNKNOWN not in rows.keep}
-    with suppress(DataError):
-        return kept_rows(table, rows)[0]
-    return table
-
-
 def set_rows(p: Proposal, rows: Mapping[str, RowWords]) -> None:
-    """Set `[rows]` in `p`, and leave the rows that are no samples out of `p.columns`.
+    """Set `[rows]` in `p`, and leave the rows that are no samples out of its tables and columns.
 
-    Nothing changes if `rows` is empty.
+    A column of `rows` with `?` is left aside, and a recording that lacks one of the others, or has
+    a word without a meaning there, keeps all rows. Nothing changes if `rows` is empty.
     """
-    if rows:
-        p.description = replace(p.description, rows=rows)
-        p.columns = columns_of([samples_only(p, table) for table in p.tables], p.description.text)
+    if not rows:
+        return
+    p.description = replace(p.description, rows=rows)
+    certain = {name: about for name, about in rows.items() if UNKNOWN not in about.keep}
+    tables = [*p.tables]
+    for i, table in enumerate(tables):
+        with suppress(DataError):
+            tables[i] = kept_rows(table, certain)[0]
+    p.tables = tables
+    p.columns = columns_of(tables, p.description.text)
 
 
 def qualify_rows(p: Proposal) -> None:
@@ -101,13 +93,12 @@ def qualify_rows(p: Proposal) -> None:
 
     Such a column has few words, and they change within a recording (`qualifies`). If it has
     several, its `keep` is `?`, with a note that counts them; if it has one, that becomes its
-    `keep`, with a note. If the user stated some words of a column, its other words are added to
+    `keep`. If the user stated some words of a column, its other words are added to
     `keep`, or to `drop` if `keep` is stated: as `*` if they are more than 12, and not if `*` is
     stated. Rows that are then known to be no samples are left out of `p.columns`. Raises
     SettingError for a malformed `windows.trigger`.
     """
     rows = dict(p.description.rows)
-    unused = p.unused
     for name in rows.keys() & p.columns.keys():
         about = rows[name]
         named = {*about.keep, *about.drop, *about.invalid}
@@ -115,39 +106,40 @@ def qualify_rows(p: Proposal) -> None:
         key = "drop" if about.keep else "keep"
         words = rest if len(rest) <= MOST_WORDS else (ANY,)
         rows[name] = replace(about, **{key: getattr(about, key) + words})
-    for column in filter(qualifies, unused):
-        text = "the only word; others will be faults"
+    n_rows = max(column.counts.total() for column in p.columns.values())
+    for column in p.unused:
+        if not qualifies(column, n_rows):
+            continue
         words = tuple(column.counts)
         if len(words) > 1:
             text = f"which rows are samples? {counts_of(column.counts)}; others drop or invalid"
+            p.notes[f"rows.{column.name}.keep"] = text
             words = (UNKNOWN,)
         rows[column.name] = RowWords(words)
-        p.notes[f"rows.{column.name}.keep"] = text
     set_rows(p, rows)
 
 
-def qualifies(column: Column) -> bool:
+def qualifies(column: Column, n_rows: int) -> bool:
     """Return whether the words of a column may tell which rows are samples.
 
-    It must have at most 12 different words, they must change within a recording, and each recording
-    must have several rows, with a cell in each. A column that is named like a status (`Status`,
-    `valid`) may have numbers, and also just one word in all. Any other must have texts, and no name
-    like a clock. A column that is named like a verdict, may have the label in one row (`row_of`),
-    and has a known word for good or bad holds labels instead, and gives False.
+    It must have at most 12 different words, they must change within a recording, and it must have a
+    cell in each of the `n_rows` rows of all recordings. A column that is named like a status
+    (`Status`, `valid`) may have numbers, and also just one word in all. Any other must have texts,
+    or empty cells if it is named like a verdict, and no name like a clock. A column that is named
+    like a verdict and has one word in each recording, of which any is known to mean good or bad,
+    holds labels instead, and gives False.
     """
     name = column.name
     words = column.counts
     is_named = QUALIFIER_NAME.search(name) is not None
-    is_text = any(column.odd) and not CLOCK_NAME.search(name)
+    is_verdict = NAME.fullmatch(name) is not None
+    has_words = any(column.odd) or (is_verdict and column.odd)  # or beside empty cells, a number
+    is_text = has_words and not CLOCK_NAME.search(name)
     varies = not column.fixed or (is_named and len(words) == 1)
-    has_rows = all(
-        len(cells) == max(map(len, table.columns.values())) > 1
-        for cells, table in zip(column.words, column.tables, strict=True)
-    )
-    if not (is_named or is_text) or not varies or not has_rows or len(words) > MOST_WORDS:
+    is_full = words.total() == n_rows
+    if not (is_named or is_text) or not varies or not is_full or len(words) > MOST_WORDS:
         return False
-    source = with_meanings(LabelSource(column=name), words)
-    return not is_verdict(column) or not {*source.good, *source.bad} - {UNKNOWN}
+    return not (is_verdict and column.fixed and has_meaning(LabelSource(column=name), words))
 
 
 def propose_part(p: Proposal) -> None:
@@ -155,18 +147,14 @@ def propose_part(p: Proposal) -> None:
 
     Its name must be like that of a part's number, and the different words in it must be more than
     half as many as `p.tables`. Columns that have a role are left out, and the lines are those of
-    the first table. If several qualify, only a note on `part.column` lists them, also if `[part]`
-    is stated. If none does, nothing is set. A stated `[part]` stays. Raises SettingError for a
-    malformed `windows.trigger`.
+    the first table. If none qualifies, or several do, nothing is set. A stated `[part]` stays.
+    Raises SettingError for a malformed `windows.trigger`.
     """
     sources = [PartSource((c.name,)) for c in p.unused if PART_NAME.search(c.name)]
     sources += [PartSource(line=line) for line in filter(PART_LINE.search, lines_of(p))]
     least = len(p.tables) / 2
     sources = [s for s in sources if len({*part_words(s, p.tables).values()}) > least]
-    if len(sources) > 1:
-        names = listed(source.line or source.column[0] for source in sources)
-        p.notes["part.column"] = f"may be one of {names}"
-    elif p.description.part == PartSource() and sources:
+    if p.description.part == PartSource() and len(sources) == 1:
         p.description = replace(p.description, part=sources[0])
 
 
@@ -177,7 +165,7 @@ def propose_channels(p: Proposal, units: Mapping[str, str]) -> None:
     along z, a name like a force, a unit of force or torque, a name like `F` or `value`, any column.
     A name decides only if the unit is that of a force or torque, or unknown. If several columns fit
     the rule, none is there, or `_doubt_on` has a reason against it, the channels stay empty, with a
-    note. Otherwise a note lists the other columns.
+    note.
 
     units : the columns that may be channels, with their units, "" for unknown.
     """
@@ -187,122 +175,107 @@ def propose_channels(p: Proposal, units: Mapping[str, str]) -> None:
     likely = [name for name, unit in units.items() if not unit or name in forces]
     named = [[*filter(pattern.search, likely)] for pattern in FORCES]
     best = next(filter(None, (*named[:2], forces, named[2], [*units])), [])
-    doubts = "; ".join(filter(None, (_doubt_on(p, name) for name in best)))
-    others = listed(name for name in units if doubts or [name] != best)
+    doubts = [*filter(None, (_doubt_on(p, name) for name in best))]
     if len(best) == 1 and not doubts:
-        p.description = replace(p.description, channels={best[0]: Channel(units[best[0]])})
-        p.notes |= {f"channels.{best[0]}": f"others: {others}"} if others else {}
-    else:
-        text = f"one or several of: {others}" if units else "no column has numbers that change"
-        text = f"{text}; {doubts}" if doubts else text
-        p.notes |= dict.fromkeys(("channels", f"channels.{UNKNOWN}"), text)
+        p.put("channels", {best[0]: units[best[0]]})
+        return
+    text = f"one or several of: {listed(units)}" if units else "no column has numbers that change"
+    text = "; ".join([text, *doubts])
+    p.notes |= dict.fromkeys(("channels", f"channels.{UNKNOWN}"), text)
 
 
 def _doubt_on(p: Proposal, name: str) -> str:
     """Return the first reason why a column may not be a channel; "" if there is none.
 
-    The reasons: the column is named like a set value or a limit; a text that does not mean a lost
-    sample is in more than 1 % of its cells; `name` is like `x*` and stands for the columns `x0`,
-    `x1`, ..., and a step between two of their numbers differs from the first step by more than half
-    of it.
+    The reasons: the column is named like a set value or a limit; `name` is like `x*` and stands for
+    the columns `x0`, `x1`, ..., and a step between two of their numbers differs from the first step
+    by more than half of it.
     """
     if SET_VALUE.search(name):
         return f"{name} may be a set value"
-    if name in p.columns and (words := _strange_in(p.columns[name])):
-        return f"{name} has words, {counts_of(words)}: do they mean a lost sample, text.missing?"
-    origin = p.tables[0].origin.get(name, ()) if ANY in name else ()
-    columns = match_numbered(name, origin)
+    columns = match_numbered(name, p.tables[0].origin.get(name, ()) if p.tables else ())
     steps = np.diff([float(match[1]) for match in columns])
     odd = np.flatnonzero(np.abs(steps - steps[:1]) > np.abs(steps[:1]) / 2)
     return f"{name} is not numbered evenly at {columns[odd[0] + 1][0]}" if len(odd) else ""
-
-
-def _strange_in(column: Column) -> Counter[str]:
-    """Return the texts in more than 1 % of the cells each, except for those in `LOST`."""
-    least = STRANGE * column.counts.total()
-    odd = column.odd.items()
-    return Counter({word: n for word, n in odd if word.lower() not in LOST and n > least})
 
 
 def _units(p: Proposal) -> dict[str, str]:
     """Return the columns that may be channels, with their units; "" for no unit.
 
     Such a column has no other use in the description so far, and at least three different numbers.
-    At most 90 % of its cells are no numbers, or 10 % if a text that does not mean a lost sample is
-    in more than 1 % of them. Times, columns named like counters of rows, and columns that are
-    constant in each recording are left out. The unit is the one that the files state, or else the
-    one in the name. Raises SettingError for a malformed `windows.trigger`.
+    At most 10 % of its cells are texts that do not mean a lost sample. Times, columns named like
+    counters of rows, and columns that are constant in each recording are left out. Raises
+    SettingError for a malformed `windows.trigger`.
     """
     units = dict[str, str]()
     for column in p.unused:
         name = column.name
-        odd = column.odd
-        n = column.counts.total()
-        most = SPARSE if _strange_in(column) else MOST_FREQUENT
-        is_number = len(column.counts) - len(odd) > 2 and odd.total() <= most * n
+        is_text = column.strange.total() > SPARSE * column.counts.total()
         is_other = is_clock(column) or COUNTER_NAME.fullmatch(name) or column.fixed
-        if is_number and not is_other:
-            units[name] = column.unit or unit_in(re.sub(r"\.\d+$|\*$", "", name))
+        if not is_text and not is_other and len(column.counts) - len(column.odd) > 2:
+            units[name] = column.unit
     return units
 
 
 def find_lost(p: Proposal) -> None:
     """Set `text.missing` in `p` to the words that stand for lost samples (cells without a value).
 
-    They are those already there, and those of the words nan, null, none, n/a, na, -, --, ---, #n/a
-    and "", an empty cell, that a channel has, in any case of letters. If more than 10 % of the
-    cells of a channel are empty, "" is not added for it if `time.column` is set, even to `?`: these
-    rows belong to another signal. `[rows]` then drops them, unless it has words of this channel
-    already, and a note says so in any case; dropped rows are left out of `p.columns`. A stated
-    `text.missing` stays, but `[rows]` changes all the same.
+    They are those already there, and those of `LOST`, also the empty cell, that a channel has, in
+    any case of letters. If another text is in more than 1 % of a channel's cells, `text.missing` is
+    `?`, with a note. If more than 10 % of the cells of a channel are empty, "" is not added for it
+    if `time.column` is set, even to `?`: these rows belong to another signal. `[rows]` then drops
+    them, unless it has words of this channel already; dropped rows are left out of `p.columns`. A
+    stated `text.missing` stays, but `[rows]` changes all the same.
     """
     rows = dict(p.description.rows)
     missing = {*p.description.text.missing}
-    for name in p.description.channels.keys() & p.columns.keys():
+    strange = dict[str, int]()
+    for name in p.description.channels:
         column = p.columns[name]
-        lost = {word for word in column.odd if word.lower() in LOST}
-        n_empty = column.counts[""] if p.description.time.column else 0
-        if n_empty > SPARSE * column.counts.total():
+        n = column.counts.total()
+        lost = column.odd.keys() - column.strange.keys()
+        if p.description.time.column and column.counts[""] > SPARSE * n:
             lost -= {""}
             rows.setdefault(name, RowWords((ANY,), ("",)))
-            p.notes[f"rows.{name}.drop"] = "rows without a value are no samples of it"
         missing |= lost
+        strange |= {word: k for word, k in column.strange.items() if k > STRANGE * n}
     set_rows(p, rows)
     p.put("text.missing", sorted(missing))
+    if strange:
+        p.put("text.missing", UNKNOWN, f"do these mean a lost sample? {counts_of(strange)}")
 
 
 def propose_lengths(p: Proposal) -> None:
     """Set `traces.samples` in `p` to the median length of the recordings, rounded down.
 
     The length is that of the first channel. Recordings without rows are ignored, and without a
-    channel it is 0. If some have another length, and `traces.lengths` is `strict` without being
-    stated, a note counts them; if they are more than 10 %, `traces.lengths` becomes `pad`.
+    channel it is 0. If some have another length, and `traces.lengths` is not stated, a note counts
+    them; if they are more than 10 %, `traces.lengths` becomes `pad`.
     """
-    words = [p.columns[name].words for name in p.description.channels if name in p.columns]
-    lengths = [n for n in map(len, words[0] if words else ()) if n]
+    first = [p.columns[name] for name in p.description.channels][:1]
+    lengths = [len(words) for column in first for words in column.words if len(words)]
     usual = int(np.median(lengths or 0))
     others = [n for n in lengths if n != usual]
-    if others and p.description.traces.lengths == "strict":
+    if others:
         text = (
-            f"{len(others)} of {len(lengths)} recordings have another length, "
-            f"{min(others)} to {max(others)}"
+            f"{len(others)} of {len(lengths)} recordings have another length, {min(others)} to "
+            f"{max(others)}; other choices: cut, pad-all, resample, strict"
         )
-        how = "pad" if len(others) > SPARSE * len(lengths) else "strict"
-        p.put("traces.lengths", how, f"{text}; other choices: cut, pad-all, resample, strict")
+        p.put("traces.lengths", "pad" if len(others) > SPARSE * len(lengths) else "strict", text)
     p.put("traces.samples", usual)
 
 
 def list_others(p: Proposal) -> None:
     """Set in `p` the columns without any use as `ignored`, and the files `p.others` as `exclude`.
 
-    `ignored` has the unit of each column, the one in its name or else the one that the files state;
-    it replaces also a stated `ignored`. Listings of labels are not excluded, and a note on
-    `exclude` lists the files. If there is none, if `exclude` is stated, or if it is `?` because
-    other files may be recordings, it stays. Raises SettingError for a malformed `windows.trigger`.
+    `ignored` has the unit of each column (`Column.unit`), and replaces also a stated `ignored`.
+    Listings of labels are not excluded. If there is no file, if `exclude` is stated, or if it is
+    `?` because other files may be recordings, it stays. Raises SettingError for a malformed
+    `windows.trigger`.
     """
     listings = {source.listing for source in p.description.labels}
     others = sorted({*p.others} - listings, key=natural_key)
     if UNKNOWN not in p.description.exclude and others:
-        p.put("exclude", others, f"not read, for they are of another form: {listed(others)}")
-    units = {column.name: unit_in(column.name) or column.unit for column in p.unused}
-    p.description = replace(p.description, ignored=units)
+        p.put("exclude", others)
+    units = {column.name: column.unit for column in p.unused}
+    p.put("ignored", units)

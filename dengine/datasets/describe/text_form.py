@@ -5,12 +5,12 @@ Each value follows from a count over the lines that were looked at. If two value
 
 import codecs
 import re
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
-from contextlib import suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from itertools import product
-from typing import Any
+from statistics import mode
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,8 +18,8 @@ from ...errors import DataError, listed
 from ..dataset import Fault
 from ..description import UNKNOWN, TextForm
 from ..read.files import caught, natural_key
-from ..read.text import BLANK, COMMENT, header_names, split_line
-from ..table import pattern_of
+from ..read.text import BLANK, COMMENT, header_names, split_line, to_utf8
+from ..table import UnreadableError, pattern_of
 from ..units import is_unit
 from .columns import LEAST_RUN, NUMBER, Proposal, Stated
 
@@ -40,8 +40,7 @@ UNIT_WORDS = re.compile(
 Rows = Sequence[Sequence[str]]
 
 
-@dataclass(frozen=True, slots=True)
-class Look:
+class Look(NamedTuple):
     """The first lines of a file.
 
     form : of the file. width : cells of a row. line : the header. rows : the cells of the samples.
@@ -67,11 +66,11 @@ def look(content: bytes, stated: Stated) -> Look:
     stated : keys that the user gave. `text.encoding` and `text.delimiter` are taken; `text.header`
     only says that a doubt about the header is no error.
     """
-    encoding, text = decode(content, str(stated.get("text.encoding", "")))
-    lines = re.split("\r\n|\r|\n", text.rstrip("\r\n"))
-    if "\0" in text or not text.strip():
-        raise DataError("Expected a text in text.encoding.")
-    marks = str(stated.get("text.delimiter", DELIMITERS))
+    encoding, text = decode(content, stated.get("text.encoding", ""))
+    lines = text.rstrip("\n").split("\n")
+    if not text.strip():
+        raise DataError("Expected a text, got an empty file.")
+    marks = stated.get("text.delimiter", DELIMITERS)
     head = lines[:MOST_LINES]
     share, width, delimiter = max((*_share_of_numbers(head, mark), mark) for mark in marks)
     if share == 0:  # a single column
@@ -86,20 +85,21 @@ def look(content: bytes, stated: Stated) -> Look:
 
 
 def decode(content: bytes, stated: str) -> tuple[str, str]:
-    """Return the encoding of a text, and the first 2 MB decoded; ("", "") if that fails.
+    """Return the encoding of a text, and its first 2 million characters, with plain line feeds.
 
     The `stated` encoding is used unless it is "". Otherwise it is UTF-16 if the text begins with
-    its byte order mark, else UTF-8, or cp1252 if UTF-8 fails. A byte order mark is left out, and a
-    character that is cut off at the end. Raises LookupError for a stated encoding that Python does
-    not know.
+    its byte order mark, else UTF-8, or cp1252 if UTF-8 fails. A byte order mark is left out. Raises
+    UnreadableError if the text is in none of them, and LookupError for a stated encoding that
+    Python does not know.
     """
     is_wide = content[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
-    encodings = ["utf-16"] if is_wide else ["utf-8", LATIN]
-    for encoding in [stated] if stated else encodings:
-        with suppress(UnicodeError):
-            text = codecs.getincrementaldecoder(encoding)().decode(content[:MOST_BYTES])
-            return encoding, text.removeprefix("\ufeff")
-    return "", ""
+    encoding = stated or ("utf-16" if is_wide else "utf-8")
+    try:
+        text = to_utf8(content, encoding)
+    except UnreadableError:
+        encoding = stated or LATIN
+        text = to_utf8(content, encoding)
+    return encoding, text.decode()[:MOST_BYTES]
 
 
 def _share_of_numbers(lines: Sequence[str], delimiter: str) -> tuple[float, int]:
@@ -112,7 +112,7 @@ def _share_of_numbers(lines: Sequence[str], delimiter: str) -> tuple[float, int]
     first third of the lines, which may be text above the samples, and empty lines are left out.
     """
     rows = [split_line(line, delimiter) for line in lines[len(lines) // 3 :] if line.strip()]
-    width = Counter(map(len, rows)).most_common(1)[0][0] if rows else 0
+    width = mode([*map(len, rows), 0])
     same = [row for row in rows if len(row) == width]
     cells = [cell for row in same for cell in row if cell.strip()]
     if width < 2 or not cells:
@@ -182,32 +182,32 @@ def _head_lines(rows: Rows, width: int, stated: Stated) -> tuple[int, int]:
     return max(heads, default=0), units
 
 
-def propose_form(p: Proposal, contents: Mapping[str, bytes]) -> None:
-    """Set `[text]` in `p` to the text form of most files, and leave out files of another form.
+def propose_form(p: Proposal, contents: Mapping[str, bytes], faults: list[Fault]) -> Sequence[str]:
+    """Set `[text]` in `p` to the text form of most files; return the names of these files.
 
-    Those have another delimiter, number of columns or header, and move from `p.names` to
-    `p.others`. If two or more of them have at least 8 rows of samples, `exclude` is set to `?`,
-    with a note that asks whether they are recordings. A file that is no text, or whose header is
-    not certain, is ignored and stays in `p.names`; if all are such, DataError is raised. Of equally
-    frequent forms the first counts. Stated keys stay.
+    Files with another delimiter, number of columns or header are left out: they move from `p.names`
+    to `p.others`. If two or more of them have at least 8 rows of samples, `exclude` is set to `?`,
+    with a note that asks whether they are recordings. For a file that is no text, or whose header
+    is not certain, a fault is appended to `faults`, and it stays in `p.names`; if all are such,
+    nothing is set and returned. Of equally frequent forms the first counts. Stated keys stay.
 
     contents : the contents of the files that are looked at, by name.
     """
-    groups = defaultdict[Any, dict[str, Look]](dict)
-    faults = list[Fault]()
+    looks = dict[str, Look]()
     for name, content in contents.items():
         with caught(faults, name):
-            item = look(content, p.stated)
-            groups[item.form.delimiter, item.width, item.line][name] = item
-    if not groups:
-        raise DataError(f"Expected a text with numbers, found none: {listed(faults[:1])}.")
-    same = groups.pop(max(groups, key=lambda key: len(groups[key])))
-    odd = {name: item for group in groups.values() for name, item in group.items()}
+            looks[name] = look(content, p.stated)
+    forms = {name: (item.form.delimiter, item.width, item.line) for name, item in looks.items()}
+    usual = mode([*forms.values(), ()])
+    same = [name for name, form in forms.items() if form == usual]
+    odd = [name for name, form in forms.items() if form != usual]
     p.others = [*p.others, *odd]
     p.names = [name for name in p.names if name not in odd]
-    if sum(len(item.rows) >= LEAST_RUN for item in odd.values()) > 1:
+    if sum(len(looks[name].rows) >= LEAST_RUN for name in odd) > 1:
         p.put("exclude", UNKNOWN, f"are {listed(odd)} recordings of another form? See files")
-    _propose_keys(p, [*same.values()])
+    if same:
+        _propose_keys(p, [looks[name] for name in same])
+    return same
 
 
 def _propose_keys(p: Proposal, looks: Sequence[Look]) -> None:
@@ -257,7 +257,7 @@ def _column_names(usual: Look) -> Sequence[str]:
         return names if len(cells) != width else []
     if width < MOST_NAMES:
         return [f"c{i}" for i in range(width)]
-    firsts, seconds = ({row[i].strip() for row in usual.rows if len(row) > i} for i in (0, 1))
+    firsts, seconds = ({row[i] for row in usual.rows if len(row) > i} for i in (0, 1))
     is_class = 1 < len(firsts) <= min(MOST_CLASSES, len(seconds) - 1)
     return ["class", "x*"] if is_class and all(map(WHOLE.fullmatch, firsts)) else ["x*"]
 
@@ -275,10 +275,9 @@ def propose_marks(p: Proposal, cells: Collection[str]) -> None:
     cells : the different texts in the samples that are numbers with any of these marks.
     """
     counts = Counter(cell.translate(SAME_DIGITS) for cell in cells)
-    possible = p.description.text.decimal if "text.decimal" in p.stated else ".,"
     n_read = {
         marks: sum(n for cell, n in counts.items() if pattern_of(*marks).fullmatch(cell))
-        for marks in product(possible, GROUPS)
+        for marks in product(p.stated.get("text.decimal", ".,"), GROUPS)
         if marks[0] != marks[1]
     }
     most = max(n_read.values())

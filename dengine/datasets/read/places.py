@@ -185,8 +185,7 @@ class LabelReader:
         expression with one group.
         """
         source = self.source
-        meanings: dict[str, int | None] = dict.fromkeys(source.unchecked)
-        meanings |= dict.fromkeys(source.bad, 0) | dict.fromkeys(source.good, 1)
+        meanings = source.meanings
         words = self.words(table, part)
         fault = ""
         if unknown := [word for word in words if word not in meanings]:
