@@ -191,9 +191,8 @@ class Learner:
         With `wait` True, or if no executor takes work, all is done in this thread, which then has
         one torch thread, and the report is returned. Otherwise None is returned, and `advance` puts
         the version in force later. With `wait` False, None is also returned if a training is under
-        way already, and then nothing is begun. If the executor still works on a discarded training,
-        or the computing in advance is not done, the training is requested, and `retrain_if_due`
-        begins it later.
+        way already, and then nothing is begun. If there is an executor, and the computing in
+        advance is not done, the training is requested, and `retrain_if_due` begins it later.
 
         A version that fails or cannot be stored is dropped, and the report says so. If the version
         is stored, but labels that came since cannot be, it is put in force by a later call; its
@@ -205,8 +204,7 @@ class Learner:
             if self.is_at_work:
                 return None
             is_preparing = self._precomputed is not None and not self._precomputed.done()
-            has_executor = self._retrainer.executor is not None
-            if has_executor and (is_preparing or self._retrainer.is_occupied):
+            if self._retrainer.executor is not None and is_preparing:
                 self._is_requested = True
                 return None
         self.store_labels()

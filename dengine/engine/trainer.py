@@ -271,7 +271,7 @@ class Retrainer:
     limits : Limits
     executor : concurrent.futures.Executor or None
         A `RestartableExecutor` that died or hangs is started again. Any other one is set to None
-        when it died or takes no more work.
+        when it died, hangs or takes no more work.
     clock : callable
         Seconds, of any origin; it must pickle for a process executor.
 
@@ -293,7 +293,6 @@ class Retrainer:
         self.executor = executor
         self.clock = clock
         self.future: Future[Trained] | None = None
-        self._left: Future[Trained] | None = None  # nobody wants it, and it may still be at work
         self._began = 0.0  # when the executor could begin with the training, by `time.monotonic`
         self._seq = np.zeros(0, dtype=np.int64)  # the labels that it was given
         self._last_seconds = deque([0.0], N_REMEMBERED)  # of the newest trainings
@@ -321,13 +320,12 @@ class Retrainer:
         """Begin to train a successor of the current model in the executor, on the present window.
 
         A successor starts from the weights of the current model, or from scratch. `collect` returns
-        the outcome; no other training may be under way. Returns False, and begins nothing, if there
-        is no executor, if it refuses work, or while it still works on a discarded training (also if
-        this is done by now, until `is_occupied` was read). An executor that refuses work is started
-        again or given up, and that is logged.
+        the outcome; no other training may be under way. It waits until the executor is done with a
+        discarded one. Returns False, and begins nothing, if there is no executor, or if it refuses
+        work. An executor that refuses work is started again or given up, and that is logged.
         """
         executor = self.executor
-        if executor is None or self._left is not None:
+        if executor is None:
             return False
         data = self.window.snapshot()
         if not self._began:
@@ -345,36 +343,19 @@ class Retrainer:
     def discard(self) -> bool:
         """Give up the training under way, without waiting; return whether there was one.
 
-        Its outcome is lost. If the executor has begun with it, it goes on working and takes no
-        other training until it is done (`is_occupied`).
+        Its outcome is lost. If the executor has begun with it, it goes on working, and the next
+        training begins when it is done.
         """
         future = self.future
         self.future = None
-        if future is not None and not future.cancel():
-            self._left = future
+        if future is not None:
+            future.cancel()
         return future is not None
 
     @property
     def is_done(self) -> bool:
         """Whether a training in the executor is done, and `collect` returns its outcome."""
         return self.future is not None and self.future.done()
-
-    @property
-    def is_occupied(self) -> bool:
-        """Whether the executor still works on a training that was discarded.
-
-        A training that hangs, which is to say that it takes longer than HUNG (60 s), does not
-        count: reading this then starts the executor again, or if that cannot be done, leaves it
-        unused until the training is done.
-        """
-        left = self._left
-        if left is None or left.done():
-            self._left = None
-            return False
-        is_hung = self._count_seconds_left() <= 0.0
-        if is_hung:
-            self._replace_executor()
-        return not is_hung
 
     def _count_seconds_left(self) -> float:
         """Return how many seconds the executor's training has left, before it counts as hung.
@@ -415,9 +396,8 @@ class Retrainer:
         """Log why a training failed, and return it as the reason of a dropped retrain.
 
         `error` is what the training, or waiting for it, raised; the reason begins with "dropped: ".
-        If the training is not done and its executor lives, it is discarded: the executor takes no
-        other training until it is done. An executor that died, or in which a training hangs, is
-        started again if it can be, or not used.
+        If the training is not done and its executor lives, it is discarded. An executor that died,
+        or in which a training hangs, is started again if it can be, or not used.
         """
         is_broken = isinstance(error, BrokenExecutor)
         training_raised = future.done() and not is_broken
@@ -426,7 +406,7 @@ class Retrainer:
             return f"dropped: {reason_of(error)}"
         failure = f"{type(error).__name__}: {error}"
         if not is_broken:
-            self.discard()
+            future.cancel()
             seconds = time.monotonic() - self._began
             failure = f"not done after {seconds:.0f} s in the executor."
         if is_broken or self._count_seconds_left() <= 0.0:
@@ -436,19 +416,16 @@ class Retrainer:
     def _replace_executor(self) -> None:
         """Start a `RestartableExecutor` again; go on without any other executor.
 
-        A restart ends what it works on, also a discarded training. If it raises OSError, that is
-        logged, and the next retrain tries again. Any other executor is set to None, which is
-        logged. But if it still works on a discarded training, it is kept, and used again once that
-        is done.
+        A restart ends what it works on. If it raises OSError, that is logged, and the next retrain
+        tries again. Any other executor is set to None, which is logged.
         """
         executor = self.executor
         if isinstance(executor, RestartableExecutor):
-            self._left = None
             try:
                 executor.restart()
             except OSError:
                 log.exception("retrains are in line until their process can be started again")
-        elif self._left is None:
+        else:
             self.executor = None
             log.error("retrains are in line from now on")
 

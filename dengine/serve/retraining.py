@@ -17,6 +17,7 @@ import pickle
 import signal
 import threading
 import weakref
+from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from multiprocessing.connection import wait
@@ -76,7 +77,7 @@ class RetrainingProcess(Executor):
         """Queue a call of a picklable function, which runs in the process after earlier calls.
 
         Returns the future of its result. If the result has arrays, wait for it before you submit
-        the next call: the end of the next call closes the file that holds these arrays. An
+        two more calls: the end of the second closes the file that holds these arrays. An
         exception of the call, or an argument or result that cannot be pickled, is the future's.
         Raises BrokenExecutor if the process has ended, and RuntimeError after `shutdown`.
         """
@@ -133,19 +134,19 @@ def _unpickle(pickled: bytes, path: str, sizes: list[int]) -> Any:
     return pickle.loads(pickled, buffers=arrays)
 
 
-_NEWEST_RESULT: list[_SharedPickle] = []  # of the last call, until the next one ends
+_NEWEST_RESULTS: deque[_SharedPickle] = deque(maxlen=2)  # a discarded one, and the next
 
 
 def _call(call: tuple[Callable[..., Any], tuple[Any, ...], dict[str, Any]]) -> _SharedPickle:
     """Call a function, in the retraining process, and return its result for pickling.
 
-    `call` is the function, its arguments and its keyword arguments. The result is kept until the
-    next call ends; before that the server's process must have read it. Raises what the function
+    `call` is the function, its arguments and its keyword arguments. The result is kept until two
+    more calls end; before that the server's process must have read it. Raises what the function
     raises.
     """
     fn, args, kwargs = call
-    _NEWEST_RESULT[:] = [_SharedPickle(fn(*args, **kwargs))]
-    return _NEWEST_RESULT[0]
+    _NEWEST_RESULTS.append(_SharedPickle(fn(*args, **kwargs)))
+    return _NEWEST_RESULTS[-1]
 
 
 def _prepare_process() -> None:
