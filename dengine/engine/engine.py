@@ -14,7 +14,6 @@ call the same methods.
 from __future__ import annotations
 
 import os
-import threading
 import time
 import weakref
 from collections.abc import Callable, Collection, Iterator
@@ -219,11 +218,10 @@ class DataEngine(AbstractContextManager["DataEngine"]):
 
         `template` is the untrained model, and the arguments from `executor` to `on_safe_mode` are
         those of `DataEngine`. From now on the store is closed when the engine is garbage-collected.
-        The modules that a retrain imports are loaded: with an executor in a thread that goes on
-        after this returns; without one before this returns, but not for an engine that only reads
-        (`reading`). Limits this thread to one torch thread. Raises SettingError for force limits in
-        seconds at an unknown rate, and StoreError if another engine owns the cell or the store
-        cannot be used.
+        Without an executor, and unless the engine only reads (`reading`), the modules that a
+        retrain imports are loaded. Limits this thread to one torch thread. Raises SettingError for
+        force limits in seconds at an unknown rate, and StoreError if another engine owns the cell
+        or the store cannot be used.
         """
         recipe = settings.recipe
         check_rate(recipe.policy.force_limits, settings.trace)
@@ -255,9 +253,6 @@ class DataEngine(AbstractContextManager["DataEngine"]):
             self._outbox, self._settings, self._live, self._learner, self._feedback
         )
         self.state = EngineState(self._live, self._learner, self._outbox)
-        self._warm_up = threading.Thread(target=template.warm_up, name="dengine-warm-up")
-        if executor is not None:
-            self._warm_up.start()
         weakref.finalize(self, _close_forgotten, self._outbox)
 
     def _resume(self) -> None:
@@ -284,15 +279,10 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         if the model can be compiled; in other cases `Learner.resume` began to. There is no time
         limit; if the computation fails, that is logged, and nothing is raised.
         """
-        self._join_warm_up()
+        self._live.template.warm_up()
         if self.state.new_labels and not self.version:
             self._learner.precompute()
         self._learner.wait_until_precomputed()
-
-    def _join_warm_up(self) -> None:
-        """Wait until what a retrain imports is loaded."""
-        if self._warm_up.ident is not None:
-            self._warm_up.join()
 
     @contextmanager
     def _closed_on_failure(self) -> Iterator[None]:
@@ -748,8 +738,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         ----------
         wait : bool, default True
             True: a version that is already trained is first put in force or dropped, and a training
-            that is not done is discarded. In the first two seconds of an engine the call also waits
-            for the modules that a retrain imports. False: begin to retrain in the executor, and
+            that is not done is discarded. With an executor the first such call also loads the
+            modules that a retrain imports. False: begin to retrain in the executor, and
             return None. If a retrain is under way, nothing is begun; if the executor cannot begin
             yet, `poll` or `report` begins it. `poll` brings it to its end. Without an executor it
             runs in this thread, and its report is returned.
@@ -764,7 +754,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         self._outbox.check_usable()
         with self._exclusive:
             if wait:
-                self._join_warm_up()  # its time is no part of the retrain's
+                self._live.template.warm_up()  # its time is no part of the retrain's
                 self._learner.end_training()  # what it would give lacks the newest labels
             else:
                 self._learner.advance()

@@ -23,6 +23,7 @@ from ..model.base import EngineModel
 from ..records import TRAINED, Ints, TraceArray
 from ..reducers.base import StopRule
 from ..store.records import LabelledTraces
+from .guard import NOT_PRECOMPUTED, guarded
 
 HUNG = 60.0  # seconds after which a training in the executor is given up
 # Share of the budget after which no step begins. It is smaller, down to the second, where the work
@@ -440,10 +441,12 @@ def train_candidate(
     without traces, and a defect of the trained model give an outcome without a model, whose reason
     begins with "dropped: ". A training that reaches a limit ends early and is accepted; its reason
     says so if the time budget ended it before its last step, and has the note of the model's report
-    if there is one. `clock` returns seconds. Nothing is logged. Sets the present thread to one
-    torch thread. It is a plain function, so that any executor can run it.
+    if there is one. `clock` returns seconds. The modules that a training imports are loaded first;
+    their time does not count, and a failure of this is logged. Sets the present thread to one torch
+    thread. It is a plain function, so that any executor can run it.
     """
     torch.set_num_threads(1)  # it holds for the present thread only
+    guarded(NOT_PRECOMPUTED, successor.warm_up)
     begin = clock()
     stop = StopRule(limits.deadline(begin), limits.max_steps, clock)
     model: EngineModel | None = None

@@ -146,7 +146,7 @@ class EngineModel(ABC):
         """
 
     def warm_up(self) -> None:  # noqa: B027  # a default: nothing to load
-        """Load the libraries that the first training needs; called in a thread of its own.
+        """Load the libraries that the first training needs; called before each training.
 
         The default does nothing.
         """
@@ -162,8 +162,9 @@ class EngineModel(ABC):
         """Decide on one trace: check faults and force limits, predict, and draw audits.
 
         The model predicts only if the trace has no fault and is within the limits; what it raises
-        is raised here, and an engine verifies the part then. An audit verifies a part that the model was certain of; whether it is
-        drawn is a fixed function of the trace's content hash and the seed.
+        is raised here, and an engine verifies the part then. An audit verifies a part that the
+        model was certain of; whether it is drawn is a fixed function of the trace's content hash
+        and the seed.
 
         Parameters
         ----------
