@@ -15,7 +15,6 @@ compiles to TorchScript. Compiled deciders are copied from templates, because sc
 import copy
 import math
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from enum import Enum
 from types import BuiltinFunctionType, FunctionType
@@ -207,26 +206,20 @@ def structure_of(eager: nn.Module) -> tuple[Any, ...]:
 def _as_key(value: object) -> object:
     """Return a hashable key of an attribute for `structure_of`; None if it makes no difference.
 
-    A list, tuple or dict gives its type and the sorted names and keys of its items. The key of an
-    item is the text of a constant, the shape of a tensor, and else its own `_as_key`. A function is
-    its own key: its address would not do, since another function may get it later. Any other value,
-    and so a constant outside a container, gives None.
+    It is the text of a constant and the shape of a tensor. A list, tuple or dict gives its type and
+    the sorted names of its items with their keys. A function is its own key: its address would not
+    do, since another function may get it later. Any other value gives None.
     """
     if isinstance(value, FUNCTIONS):
         return value
+    if isinstance(value, CONSTANTS):
+        return repr(value)
+    if isinstance(value, Tensor):
+        return tuple(value.shape)
     if not isinstance(value, list | tuple | dict):
         return None
-    keys: list[tuple[str, object]] = []
-    for name, item in value.items() if isinstance(value, dict) else enumerate(value):
-        key: object
-        if isinstance(item, CONSTANTS):
-            key = repr(item)
-        elif isinstance(item, Tensor):
-            key = tuple(item.shape)
-        else:
-            key = _as_key(item)
-        keys.append((repr(name), key))
-    return (type(value), *sorted(keys))
+    items = value.items() if isinstance(value, dict) else enumerate(value)
+    return (type(value), *sorted((repr(name), _as_key(item)) for name, item in items))
 
 
 def compiled(eager: Decider, warm_up_shape: tuple[int, ...]) -> Any:
@@ -495,39 +488,23 @@ class ModelPrediction(EngineModel):
         """Let the reducer compute in advance what a training on these traces (n, C, T) begins with.
 
         `numbers` are the labels' sequence numbers, by which the reducer finds its results again.
-        Extreme samples are clipped first. It computes in a thread of its own, with one thread of
-        torch, after its `untrained_module`, which may draw kernels, was asked for. Before the first
-        training, if reducer and decision rule can be compiled, the caller's thread compiles a
-        decider meanwhile, because the first retrain has no time for that; the process keeps it as a
-        template (`template_of`). The call returns when both are done, and raises what either raised
-        (the caller's thread first).
+        Extreme samples are clipped first. Before the first training, if reducer and decision rule
+        can be compiled, a decider without references is compiled as well, because the first retrain
+        has no time for that; the process keeps it as a template (`template_of`). Raises what
+        `template_of` and the reducer raise.
         """
         X = clip_extremes(X)
         encoder = self.spaces.untrained_module(X)
-        with ThreadPoolExecutor(1, "dengine-precompute", torch.set_num_threads, (1,)) as pool:
-            computing = pool.submit(self.spaces.precompute, X, numbers)
-            is_untrained = "index" not in vars(self)
-            is_scriptable = encoder is not None and self.rule.scriptable
-            if is_untrained and is_scriptable:
-                self._compile_template(encoder, X.shape[1:])
-            computing.result()
-
-    def _compile_template(self, encoder: Any, trace_shape: tuple[int, ...]) -> None:
-        """Compile a decider for traces of this shape (C, T), without references.
-
-        `encoder` is the module of the untrained reducer. The process keeps the compiled decider as
-        a template, from which `compiled` copies later deciders. Nothing in the model changes.
-        Raises what `template_of` raises.
-        """
-        channels, samples = trace_shape
-        gate = NoveltyGate(channels, samples)
-        gate.disabled = not self.novelty
-        references = RadiusIndex(encoder.dim, self.classifier.capacity)
-        neighbours = self.classifier.neighbours_over(references, self.rule, self.spaces.scores)
-        predictor = Predictor(encoder, torch.ones(self.n_spaces), gate, neighbours)
-        conditions = DecisionConditions(TraceSpec(samples, channels=channels))
-        decider = Decider(predictor, conditions, (self.n_spaces, encoder.dim))
-        template_of(decider.eval(), trace_shape)
+        self.spaces.precompute(X, numbers)
+        is_untrained = "index" not in vars(self)
+        if is_untrained and encoder is not None and self.rule.scriptable:
+            model = copy.copy(self)
+            model.trace_shape = X.shape[1:]
+            model.gate = NoveltyGate(*model.trace_shape)
+            model.gate.disabled = not self.novelty
+            model.index = RadiusIndex(encoder.dim, self.classifier.capacity)
+            model.scale = np.ones(self.n_spaces, np.float32)
+            template_of(model._eager_decider(encoder, None), model.trace_shape)
 
     def prepare(self, previous: EngineModel) -> None:
         """Take over the decision rule object of the previous model, and build the decider.
@@ -574,21 +551,24 @@ class ModelPrediction(EngineModel):
         RuntimeError, torch.jit.Error, FrontendError, OSError
             If TorchScript cannot compile or run the reducer's module, see `script`.
         """
-        conditions = conditions or DecisionConditions(self.trace_spec)
         encoder = self.spaces.module()
-        neighbours: Any = self.classifier.neighbours_over(self.index, self.rule, self.spaces.scores)
-        scale = torch.from_numpy(self.scale)
-        shape = (self.n_spaces, self.index.dim)
         if encoder is not None and self.rule.scriptable:
-            predictor = Predictor(encoder, scale, self.gate, neighbours)
-            decider: Decider = compiled(
-                Decider(predictor, conditions, shape).eval(), self.trace_shape
-            )
+            eager = self._eager_decider(encoder, conditions)
+            decider: Decider = compiled(eager, self.trace_shape)
             return decider
         encoder = InPython(self.spaces) if encoder is None else script(encoder)
-        neighbours = script(neighbours) if self.rule.scriptable else neighbours
-        predictor = Predictor(encoder, scale, script(self.gate), neighbours)
-        return Decider(predictor, conditions, shape).eval()
+        decider = self._eager_decider(encoder, conditions)
+        decider.predictor.novelty = script(self.gate)
+        if self.rule.scriptable:
+            decider.predictor.neighbours = script(decider.predictor.neighbours)
+        return decider
+
+    def _eager_decider(self, encoder: Any, conditions: DecisionConditions | None) -> Decider:
+        """Return a decider in Python for `build_decider`, around an encoder of traces."""
+        neighbours = self.classifier.neighbours_over(self.index, self.rule, self.spaces.scores)
+        predictor = Predictor(encoder, torch.from_numpy(self.scale), self.gate, neighbours)
+        conditions = conditions or DecisionConditions(self.trace_spec)
+        return Decider(predictor, conditions, (self.n_spaces, self.index.dim)).eval()
 
     @property
     def trace_spec(self) -> TraceSpec:
