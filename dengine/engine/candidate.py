@@ -10,7 +10,7 @@ happens either all at once or in short steps between cycles.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 
 from ..decision.scripting import reason_of
@@ -69,25 +69,19 @@ class Candidate:
         """Count the time from now on as the cell's own, which the retrain's report leaves out."""
         self._seconds += self._clock() - self._work_began
 
-    def check(self) -> Iterator[None]:
+    def check(self) -> None:
         """Make the model ready to decide, and test it on some traces of its training.
 
-        The model takes over the rule of the previous model, which decides until now. Then the
-        generator yields before each test, which decides on one trace. If the compiled model gives
-        another result than the trained one, or raises, the training is dropped: `model` becomes
-        None, and the report says why. An exception, also one while the rule is taken over, is
-        logged and not raised. If `model` is None already, nothing is done.
+        The model takes over the rule of the previous model, which decides until now. If the
+        compiled model gives another result than the trained one, or raises, the training is
+        dropped: `model` becomes None, and the report says why. An exception, also one while the
+        rule is taken over, is logged and not raised. If `model` is None already, nothing is done.
         """
         if self.model is None:
             return
-        defect = ""
         try:
             self.model.prepare(self._previous)
-            yield
-            for defect in self.model.check_answers():
-                if defect:
-                    break
-                yield
+            defect = self.model.check_answers()
         except Exception as error:  # no exception inside a model reaches the cell
             log.exception("the model that was trained cannot answer")
             defect = reason_of(error)

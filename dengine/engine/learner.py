@@ -426,7 +426,8 @@ class Learner:
         waits for it. Raises StoreError if the version cannot be stored. The functions that it
         yields raise StoreError if the labels cannot.
         """
-        yield from candidate.check()
+        candidate.check()
+        yield None
         yield from self._catch_up_candidate(candidate)
         storing = self._begin_storing(candidate)
         deadline = time.monotonic() + self._outbox.limit  # to begin; a commit that runs may go on

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import copy
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Protocol, Self, runtime_checkable
 
@@ -326,13 +326,12 @@ class EngineModel(ABC):
         """
         return ""
 
-    def check_answers(self) -> Iterator[str]:
-        """Decide on some training traces, one with each step of the iterator.
+    def check_answers(self) -> str:
+        """Decide on some training traces; return why the model must not be used, "" if it may be.
 
-        For each trace it yields why the model must not be used, or "" if it may be used. It is
-        called in the process that will decide, after `prepare`. The default yields nothing.
+        It is called in the process that will decide, after `prepare`. The default returns "".
         """
-        return iter(())
+        return ""
 
     @property
     def report(self) -> FitReport:

@@ -14,7 +14,6 @@ compiles to TorchScript. Compiled deciders are copied from templates, because sc
 
 import copy
 import math
-from collections.abc import Iterator
 from dataclasses import replace
 from enum import Enum
 from types import BuiltinFunctionType, FunctionType
@@ -239,10 +238,10 @@ def compiled(eager: Decider, warm_up_shape: tuple[int, ...]) -> Any:
     return module
 
 
-def compare_points(decider: Decider, X: Floats, points: Floats) -> Iterator[str]:
+def compare_points(decider: Decider, X: Floats, points: Floats) -> str:
     """Compare the embeddings of a decider with the points of a reducer.
 
-    Each step of the iterator decides on one trace; what the decider raises is raised there.
+    What the decider raises is raised.
 
     Parameters
     ----------
@@ -252,17 +251,18 @@ def compare_points(decider: Decider, X: Floats, points: Floats) -> Iterator[str]
     points : array of float32, shape (n, K, d)
         The scaled embeddings that the reducer gives.
 
-    Yields
-    ------
+    Returns
+    -------
     str
-        For each trace a sentence on what is wrong; "" if the two agree (`is_close`, within 0.001),
-        and for a trace in which the decider finds a fault.
+        A sentence on what is wrong; "" if the two agree on each trace (`is_close`, within 0.001) in
+        which the decider finds no fault.
     """
     for x, expected in zip(X, points, strict=True):
         with torch.inference_mode():
             verdict = decider(torch.from_numpy(x), 0)
-        is_same = verdict[0] != 0 or is_close(verdict[9].numpy(), expected)
-        yield "" if is_same else OTHERWISE_COMPILED
+        if verdict[0] == 0 and not is_close(verdict[9].numpy(), expected):
+            return OTHERWISE_COMPILED
+    return ""
 
 
 def is_close(points: Floats, expected: Floats, tolerance: float = SAME_POINTS) -> bool:
@@ -830,11 +830,11 @@ class ModelPrediction(EngineModel):
         answers = (restored.embed(self.examples) for _ in range(N_CHECKS))
         return "" if all(is_close(z, points, SAME_BATCH) for z in answers) else NOT_RESTORED
 
-    def check_answers(self) -> Iterator[str]:
+    def check_answers(self) -> str:
         """Compare the decider's embeddings of `examples` with the points that `defect` kept.
 
-        Yields for each example why the model must not be used, "" if it may be used. Call `defect`
-        before. The call raises what `build_decider` raises, and a step what the decider raises.
+        Returns why the model must not be used, "" if it may be used. Call `defect` before. Raises
+        what `build_decider` raises, and what the decider raises.
         """
         decider = self.decider(self._conditions)
         return compare_points(decider, self.examples, self._example_points)
