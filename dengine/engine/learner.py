@@ -23,14 +23,14 @@ from ..errors import StoreError, log
 from ..model.base import EngineModel
 from ..records import RetrainReport
 from ..store.outbox import Outbox
-from ..store.records import Change, ModelVersion, without_rule
+from ..store.records import Change
 from .candidate import Candidate
 from .feedback import Feedback, Remedy
 from .fleet import Peers
 from .guard import NOT_PRECOMPUTED, NOT_READY, guarded
 from .labels import CellLabels
 from .live_model import LiveModel
-from .resume import add_labels_since, find_clean_start, refit
+from .resume import add_labels_since, find_clean_start, restore_model
 from .settings import EvidenceWindow
 from .trainer import Clock, Retrainer, Trained, TrainedOn, TrainingWindow
 
@@ -650,14 +650,22 @@ class Learner:
         in the store. Once it is in force, new labels count from zero, since the version knows all
         labels until now. A retrain that was requested before is not begun any more.
 
+        A baseline, which is fitted again, gets the labels as they count now, since it cannot take
+        a label back. An exception as the model takes over the rule in force is logged.
+
         Raises StoreError if the version is not kept, if a trace is damaged that the model must be
         fitted on again, and if the version cannot be stored, also because another cell of the
-        product stored one meanwhile; and what `_restore_with_rule_in_force` raises.
+        product stored one meanwhile; and what `restore_model` raises.
         """
         begin = self._clock()
         self._outbox.check_integrity()
         version = self._store.versions.load(number)
-        model, trained_on = self._restore_with_rule_in_force(version)
+        template = self.live.template
+        trained_on = TrainedOn.from_state(version.state)
+        if not template.keeps_references:
+            trained_on = replace(trained_on, corrected_to=self.live.corrected_to)
+        model = restore_model(self._outbox, template, version, trained_on)
+        guarded(NOT_READY, model.prepare, self.live.newest)
         newest = self._window.newest_seq
         add_labels_since(model, self._store, version, self._window.capacity, shared_to=newest)
         trained_on = replace(trained_on, counts_from=newest, pinned=number)
@@ -666,31 +674,6 @@ class Learner:
         self._is_requested = False  # what was asked for was to replace another version
         self.labels.begin_retrain()
         self._precompute_other_start()
-
-    def _restore_with_rule_in_force(self, version: ModelVersion) -> tuple[EngineModel, TrainedOn]:
-        """Return the model of a stored version with the rule in force, and what it was trained on.
-
-        A model like umap-learn, of which not the fit but only the numbers of its traces are stored,
-        is fitted on these traces again, with the labels that they had then. A baseline is fitted on
-        its traces with the labels as they count now, since it cannot take a label back. The model
-        is not put in force. An exception as it takes over the rule is logged. Raises StoreError if
-        one of these traces has changed, or if this dengine cannot restore the version (then also
-        the other errors of `restore_model`), and what the fit raises.
-        """
-        state = without_rule(version.state)
-        trained_on = TrainedOn.from_state(version.state)
-        model = self.live.template.successor()
-        if not model.keeps_references:
-            trained_on = replace(trained_on, corrected_to=self.live.corrected_to)
-        if model.needs_refit(state) and not refit(model, self._outbox, trained_on):
-            raise StoreError(
-                f"Expected the traces that version {version.version} was fitted on as they were "
-                "stored, some have changed; see `dengine verify`, and restore the store from a "
-                "copy."
-            )
-        model.set_state(state)
-        guarded(NOT_READY, model.prepare, self.live.newest)
-        return model, trained_on
 
     def set_policy(self, policy: Policy | None, evidence: EvidenceWindow, event: Change) -> None:
         """Go on under another policy, as a new version of the same model.

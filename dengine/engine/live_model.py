@@ -6,6 +6,7 @@ when.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,11 +21,10 @@ from ..store.records import (
     OutcomeRecord,
     StoredDecision,
     overdue_outcomes,
-    without_rule,
 )
 from ..store.rule_progress import read_rule_progress
 from .guard import NO_REFERENCE, NOT_READY, RULE_MISSED, guarded
-from .resume import add_labels_since, apply_correction, restore_model
+from .resume import ChangedTracesError, add_labels_since, apply_correction, restore_model
 from .settings import EvidenceWindow
 from .trainer import TrainedOn, TrainingWindow
 
@@ -144,10 +144,14 @@ class LiveModel:
         self.newest_version = newest_version
         model = None
         if version is not None:
+            trained_on = TrainedOn.from_state(version.state)
             # A later version may be damaged: what an earlier one's rule learned under another
             # policy is left out.
-            state = version.state if version.version >= since else without_rule(version.state)
-            model = restore_model(self.outbox, self.template, state)
+            with_rule = version.version >= since
+            with suppress(ChangedTracesError):
+                model = restore_model(
+                    self.outbox, self.template, version, trained_on, with_rule=with_rule
+                )
         past = read_rule_progress(
             store, None if model is None else version, since, label_within, policy_since
         )
@@ -158,7 +162,7 @@ class LiveModel:
             numbers = (correction.number for correction in store.corrections.after())
             self.corrected_to = max(numbers, default=0)
             return
-        self.swap_in(model, version.version, TrainedOn.from_state(version.state))
+        self.swap_in(model, version.version, trained_on)
         guarded(NOT_READY, model.prepare, self.template)
         self.corrected_to = add_labels_since(model, store, version, self.window.capacity)
         if past.last_seq:
