@@ -13,7 +13,7 @@ from collections.abc import Callable
 from enum import Enum
 
 from ..errors import log
-from ..records import Action, Reason, Source, source_of
+from ..records import Action, Source, source_of
 from ..store.outbox import Outbox
 from ..store.records import (
     LATE_STOP,
@@ -26,13 +26,6 @@ from ..store.records import (
 from .labels import CellLabels
 from .live_model import LiveModel
 from .settings import SettingsInForce
-
-RECENT = 50  # decisions that the share of novel ones fades over
-NEARLY_ALL = 0.8  # of them, and somebody should look
-ALL_NOVEL = (
-    "nearly every trace is novel: the sensor or the parts have changed, "
-    "or parts come twice without numbers (part=)"
-)
 
 
 class Remedy(Enum):
@@ -90,8 +83,6 @@ class Feedback:
         # Accepted parts that went on without an outcome since the last label.
         self._n_unreported = 0
         self._safe_mode = ""
-        self._novel_share = 0.0  # of the recent decisions
-        self._novelty_reported = False
 
     @property
     def _stops_all(self) -> bool:
@@ -128,9 +119,7 @@ class Feedback:
 
         A VERIFY of a trace with a fault is not pending, nor is a VERIFY that could not be recorded
         (its number is 0). The rule counts each check that has become overdue as a wrong decision
-        (`_count_overdue`). When more than 80 % of the decisions have `Reason.NOVEL`, in a mean that
-        fades over 50 decisions and begins at 0, an event is recorded, and the next such event only
-        after this share has fallen to one half or less.
+        (`_count_overdue`).
         """
         decision = stored.decision
         if decision.action is Action.VERIFY and not stored.quarantined and stored.number:
@@ -138,13 +127,6 @@ class Feedback:
         self._count_overdue()
         if decision.action is Action.ACCEPT:
             self._unreported[decision.id] = stored
-        is_novel = decision.reason is Reason.NOVEL
-        self._novel_share += (is_novel - self._novel_share) / RECENT
-        if self._novel_share > NEARLY_ALL and not self._novelty_reported:
-            self._outbox.record_event("novelty", ALL_NOVEL)
-        # Reported again only after the share has fallen to one half.
-        limit = 0.5 if self._novelty_reported else NEARLY_ALL
-        self._novelty_reported = self._novel_share > limit
 
     def confirm_unreported(self) -> None:
         """Confirm or count the accepted parts without an outcome, because the next trace has come.
@@ -292,8 +274,7 @@ class Feedback:
         while pending and next(iter(pending.values())).number <= overdue_to:
             _, stored = pending.popitem(last=False)
             self._live.count_overdue(stored.decision)
-        if overdue_to > self._live.overdue_to:
-            self._live.mark_examined_to(overdue_to)
+        self._live.mark_examined_to(overdue_to)
 
     def take_remedy(self) -> Remedy | None:
         """Return, once, what must be put right after a wrong label; None if nothing must be."""

@@ -44,8 +44,8 @@ def restore_model(
     not count as missing. The new model and the template share one rule, so with `with_rule` the
     template gets the stored rule, too, if the version holds one.
 
-    Raises ChangedTracesError if one of these traces is missing or damaged; an event is written to the
-    store that names the damaged ones. Raises StoreError (KeyError, ValueError or
+    Raises ChangedTracesError if one of these traces is missing or damaged; an event is written to
+    the store that names the damaged ones. Raises StoreError (KeyError, ValueError or
     NotImplementedError, if it is of another reducer) for a state that this dengine cannot restore,
     StoreError for a label that is neither 0 nor 1, for traces of different shapes, and if the store
     does not answer, and what the training raises.
