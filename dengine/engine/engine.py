@@ -59,7 +59,6 @@ from .exclusive import ExclusiveUse
 from .feedback import Feedback, Remedy
 from .fleet import Peers
 from .garbage import frozen_objects, uncollected
-from .labels import CellLabels
 from .learner import Learner
 from .live_model import LiveModel
 from .settings import (
@@ -238,15 +237,14 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         self._settings = SettingsInForce(settings, self._outbox)
         window = TrainingWindow(recipe.window)
         self._live = LiveModel(template, window, self._outbox, settings.evidence)
-        labels = CellLabels(window, self._live)
         peers = None
         if store.product is not None:
             peers = Peers(self._outbox, self._live, window, clock)
-        self._feedback = Feedback(self._outbox, self._live, labels, self._settings, on_safe_mode)
+        self._feedback = Feedback(self._outbox, self._live, window, self._settings, on_safe_mode)
         limits = Limits(None if replaying else recipe.budget, recipe.max_steps)
         retrainer = Retrainer(window, limits, executor, clock)
         self._learner = Learner(
-            self._outbox, self._live, window, labels, self._feedback, peers, retrainer, clock
+            self._outbox, self._live, window, self._feedback, peers, retrainer, clock
         )
         self._maker = DecisionMaker(self._settings, self._live, self._outbox)
         self._corrections = Corrections(

@@ -23,9 +23,9 @@ from ..store.records import (
     StoredDecision,
     already_reported,
 )
-from .labels import CellLabels
 from .live_model import LiveModel
 from .settings import SettingsInForce
+from .trainer import TrainingWindow
 
 
 class Remedy(Enum):
@@ -44,8 +44,9 @@ class Feedback:
         Takes the labels.
     live : LiveModel
         Learns from them.
-    labels : CellLabels
-        Takes each label that is recorded.
+    window : TrainingWindow
+        Takes each label that is recorded; in a product, whose cells share labels, `fleet.Peers`
+        reads them from the store instead.
     settings : SettingsInForce
         Whether an accepted part without a report is confirmed by the next decision, and since which
         version.
@@ -55,6 +56,10 @@ class Feedback:
 
     Attributes
     ----------
+    new_labels : int
+        Labels since the last retrain began; each counts as soon as it is learned. In a product
+        these are the cell's own, and those of peers that came after the version in force was
+        trained, and before this cell put it in force or opened the store.
     remedy : Remedy or None
         What must be done after a wrong label was learned, as soon as the store has every label;
         `learner.Learner` does it.
@@ -64,16 +69,20 @@ class Feedback:
         self,
         outbox: Outbox,
         live: LiveModel,
-        labels: CellLabels,
+        window: TrainingWindow,
         settings: SettingsInForce,
         on_safe_mode: Callable[[str], object] | None = None,
     ) -> None:
         self._outbox = outbox
         self._live = live
-        self._labels = labels
+        self._window = window
         self._settings = settings
         self._on_safe_mode = on_safe_mode
+        self.new_labels = 0
         self.remedy: Remedy | None = None
+        # In a product: labels that the store has not numbered, by decision, with the provisional
+        # numbers of their references.
+        self._provisional: dict[str, int] = {}
         # Accepted parts without an outcome yet.
         self._unreported: OrderedDict[str, StoredDecision] = OrderedDict()
         # Reports that were learned and are not known to be on disk.
@@ -230,8 +239,13 @@ class Feedback:
             seq=number,
         )
         self._outbox.record_labels([(stored, label)])
-        if not stored.quarantined:
-            self._labels.add(stored, label)
+        if stored.quarantined:
+            return
+        self.new_labels += 1
+        if number > 0:
+            self._window.add(stored.trace, int(success), stored.content_hash, number)
+        else:
+            self._provisional[decision.id] = number
 
     def _was_unreported(self, stored: StoredDecision) -> bool:
         """Return whether this part is one of those counted as unreported.
@@ -254,9 +268,22 @@ class Feedback:
         far. Nothing is raised.
         """
         self._count_overdue()
-        if self._labels.has_provisional:
-            for id_, number in self._outbox.pop_label_numbers():
-                self._labels.assign_number(id_, number)
+        if not self._provisional:
+            return
+        for id_, number in self._outbox.pop_label_numbers():
+            provisional = self._provisional.pop(id_, None)  # None: of a trace with a fault
+            if provisional is not None and self._live.answering is not None:
+                self._live.answering.renumber_reference(provisional, number)
+
+    def count_new_labels(self, after: int) -> None:
+        """Count the labels of the training window with a number above this one as new."""
+        self.new_labels = len(self._window.newer(after))
+
+    def give_labels_back(self, n_labels: int) -> None:
+        """Count the labels of a retrain that was dropped as new again, so that the next one comes
+        soon.
+        """
+        self.new_labels += n_labels
 
     def _count_overdue(self) -> None:
         """Update the rule with each decision whose check has become overdue, as with a wrong one.

@@ -28,7 +28,6 @@ from .candidate import Candidate
 from .feedback import Feedback, Remedy
 from .fleet import Peers
 from .guard import NOT_PRECOMPUTED, NOT_READY, guarded
-from .labels import CellLabels
 from .live_model import LiveModel
 from .resume import add_labels_since, find_clean_start, restore_model
 from .settings import EvidenceWindow
@@ -47,7 +46,6 @@ class Learner:
     outbox : Outbox
     live : LiveModel
     window : TrainingWindow
-    labels : CellLabels
     feedback : Feedback
     peers : Peers or None
         None if the cell shares no product.
@@ -66,19 +64,17 @@ class Learner:
         outbox: Outbox,
         live: LiveModel,
         window: TrainingWindow,
-        labels: CellLabels,
         feedback: Feedback,
         peers: Peers | None,
         retrainer: Retrainer,
         clock: Clock,
     ) -> None:
         self.live = live
-        self.labels = labels
+        self.feedback = feedback
         self.dropped: list[str] = []
         self._outbox = outbox
         self._store = outbox.store  # called without a time limit, so never while the cell waits
         self._window = window
-        self._feedback = feedback
         self._peers = peers
         self._retrainer = retrainer
         self._clock = clock
@@ -117,7 +113,7 @@ class Learner:
         """
         capacity = self._window.capacity
         self._window.refill(self._store.labels.with_traces(capacity, corrected_to=corrected_to))
-        self.labels.count_from(self.live.trained_on.counts_from)
+        self.feedback.count_new_labels(self.live.trained_on.counts_from)
 
     def precompute(self) -> None:
         """Start a thread that computes in advance what the next training needs; do not wait for it.
@@ -151,10 +147,10 @@ class Learner:
         retrained here, or, if it is pinned, fitted again, and what that raises is raised. If the
         store fails meanwhile, that is logged and not raised, and a later call tries again.
         """
-        self._feedback.number_labels()
-        if self._feedback.remedy is None or not self._outbox.is_drained or self._outbox.fault:
+        self.feedback.number_labels()
+        if self.feedback.remedy is None or not self._outbox.is_drained or self._outbox.fault:
             return
-        remedy = self._feedback.take_remedy()
+        remedy = self.feedback.take_remedy()
         if remedy is None:
             return
         try:
@@ -164,7 +160,7 @@ class Learner:
             else:
                 self.live.rebuild_rule()
         except StoreError:
-            self._feedback.retry_remedy(remedy)
+            self.feedback.retry_remedy(remedy)
             log.exception("the rule is rebuilt when the store is back")
 
     def store_labels(self) -> None:
@@ -211,7 +207,7 @@ class Learner:
         begin = self._clock()
         self.wait_until_precomputed()
         self._hear_of_peers()
-        self.labels.begin_retrain()
+        self.feedback.count_new_labels(self._window.newest_seq)
         self._is_requested = False
         start = self._choose_start()
         if not wait and self._retrainer.start(start):
@@ -252,16 +248,15 @@ class Learner:
             preparation is under way, or if the executor now trains.
         """
         peers = self._peers
-        may_train = self.labels.is_due(retrain_every) and not self.live.pinned
+        may_train = self.feedback.new_labels >= retrain_every and not self.live.pinned
         if peers is not None and (may_train or peers.is_look_due):
             self._try_to_hear(peers, with_labels=False)
         if self.live.pinned:
             self._is_requested = False
             return None
-        is_due = self.labels.is_due(retrain_every)
-        if is_due:
-            n_labels = max(self.labels.new_labels, len(self._window))
-            is_due = n_labels >= self.live.newest.min_traces
+        n_new = self.feedback.new_labels
+        n_labels = max(n_new, len(self._window))
+        is_due = n_new >= retrain_every and n_labels >= self.live.newest.min_traces
         # A training may have ended by its budget, as after a large import; then another begins
         # without new labels. Peers would each train the same version, so they wait for labels.
         is_alone = self._peers is None and self._was_accepted
@@ -447,7 +442,7 @@ class Learner:
         itself; a StoreError there is ignored.
         """
         for n_waits in count(1):
-            self._feedback.number_labels()
+            self.feedback.number_labels()
             while candidate.learn_next(self._window):
                 yield None
             if not self._outbox.request_label_drain():
@@ -501,7 +496,7 @@ class Learner:
         log.warning("a retrain was dropped, for it could not be stored: %s", error)
         self._candidate = None
         self._was_accepted = False
-        self.labels.give_back(candidate.report.n_traces)
+        self.feedback.give_labels_back(candidate.report.n_traces)
         self._report = replace(
             candidate.report,
             version=self.live.version,
@@ -564,7 +559,7 @@ class Learner:
             self.apply_corrections(may_retrain=False)
         peers.read_labels()
         if is_newer:
-            self.labels.count_from(self.live.trained_on.counts_from)
+            self.feedback.count_new_labels(self.live.trained_on.counts_from)
 
     # What people put right
 
@@ -672,7 +667,7 @@ class Learner:
         reason = f"rolled back to version {number}"
         self._store_and_swap_in(event, model, trained_on, reason, self._clock() - begin)
         self._is_requested = False  # what was asked for was to replace another version
-        self.labels.begin_retrain()
+        self.feedback.count_new_labels(newest)
         self._precompute_other_start()
 
     def set_policy(self, policy: Policy | None, evidence: EvidenceWindow, event: Change) -> None:
