@@ -91,15 +91,10 @@ class TrainingWindow:
         are not changed.
         """
         n = len(self)
-        columns = [column[self._first :] for column in self._block]
-        room = n + max(n // 2, 64)
-        shapes: list[tuple[int, ...]] = [(room,), (room, *trace_shape), (room,), (room,)]
-        self._block = [
-            np.empty(shape, column.dtype) for shape, column in zip(shapes, columns, strict=True)
-        ]
-        if n:  # an empty window does not know the traces' shape
-            for new, old in zip(self._block, columns, strict=True):
-                new[:n] = old
+        shapes = ((), trace_shape, (), ())
+        for i, (column, shape) in enumerate(zip(self._block, shapes, strict=True)):
+            room = np.empty((max(n // 2, 64), *shape), column.dtype)
+            self._block[i] = np.concatenate([column[self._first :].reshape(n, *shape), room])
         self._first = 0
         self._end = n
 
