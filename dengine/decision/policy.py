@@ -163,15 +163,14 @@ class Policy:
         Raises SettingError if they are not three finite numbers above 0, or if an error costs no
         more than two checks.
         """
-        prices = (0.0, 0.0, 0.0)
-        has_three = isinstance(self.prices, tuple | list) and len(self.prices) == 3
-        if has_three and all(map(is_number, self.prices)):
-            check, escape, false_reject = self.prices
-            prices = (float(check), float(escape), float(false_reject))
-        is_valid = 0.0 < 2.0 * prices[0] < min(prices[1:]) and max(prices) < math.inf
+        given = self.prices if isinstance(self.prices, tuple | list) else ()
+        prices = [float(price) for price in given if is_number(price)]
+        is_valid = len(prices) == len(given) == 3
+        is_valid = is_valid and 0.0 < 2.0 * prices[0] < min(prices[1:]) and max(prices) < math.inf
         wanted = "prices of a check, an escape and a false reject, errors above two checks"
         expect(is_valid, wanted, self.prices, "as in 5,120,47.5")
-        return prices
+        check, escape, false_reject = prices
+        return check, escape, false_reject
 
     def to_values(self) -> dict[str, Any]:
         """Return every setting by its name; the force limits are one text, "none" without any."""
