@@ -31,7 +31,7 @@ from ..traces import check_rate
 from .feedback import Feedback
 from .learner import Learner
 from .live_model import LiveModel
-from .settings import BASELINE_SETTINGS, EvidenceWindow, Settings, SettingsInForce
+from .settings import BASELINE_SETTINGS, EvidenceWindow, SettingsInForce, refuse_idle
 
 # Settings of a policy that make its rule, or that its evidence is measured by.
 SCORING = ("alpha", "lower_bound", "interval", "guarantee", "stops", "prices")
@@ -355,7 +355,7 @@ class Corrections:
             return self._as_unchanged("policy", "The policy is in force already")
         is_baseline = present.model is not None  # it keeps its rule
         if is_baseline:
-            _check_baseline_settings(changes)
+            refuse_idle(sorted(changes.keys() - BASELINE_SETTINGS))
         self._bring_up_to_date()
         # An audit counts by its inclusion probability, so the pooled evidence must be of one audit
         # rate.
@@ -448,20 +448,6 @@ class Corrections:
     def _as_unchanged(self, kind: str, text: str) -> Changed:
         """Return a `Changed` for a request that was fulfilled already; no event is recorded."""
         return Changed(kind, _sentence(f"{text}; nothing changed."), None, self._live.version)
-
-
-def _check_baseline_settings(changes: Settings) -> None:
-    """Raise SettingError for changes of a policy that have no effect on a handed-in model.
-
-    `changes` holds the changed settings by name. Only audit_rate, stops, label_within, force_limits
-    and shadow (`BASELINE_SETTINGS`) have an effect.
-    """
-    idle = sorted(set(changes) - set(BASELINE_SETTINGS))
-    if idle:
-        raise SettingError(
-            f"A model that was handed in decides by its own numbers, so {', '.join(idle)} would "
-            "have no effect; change only audit_rate, stops, label_within, force_limits and shadow."
-        )
 
 
 def _sentence(text: str) -> str:

@@ -439,6 +439,14 @@ def check_model_settings(reducer: Any, given: Settings) -> None:
     effective = {name: getattr(Policy(), name) for name in BASELINE_SETTINGS}
     if policy is not None and replace(policy, **effective) != Policy():
         idle.append("policy")
+    refuse_idle(idle)
+
+
+def refuse_idle(idle: Collection[str]) -> None:
+    """Raise SettingError for settings that have no effect on a handed-in model, if there are any.
+
+    `idle` holds their names.
+    """
     if idle:
         raise SettingError(
             f"A model that is handed in decides by its own rule, so {', '.join(idle)} would have "
