@@ -68,8 +68,9 @@ def label_agreement(
     spaces = spaces[-SAMPLE:]
     parts = parts[-SAMPLE:]
     _, part, n_times = np.unique(parts, return_inverse=True, return_counts=True)
-    repeated = (n_times[part] > 1) & (parts != 0)
-    if len(np.unique(part[repeated])) < FEWEST_PARTS:
+    is_repeated = (n_times[part] > 1) & (parts != 0)
+    repeated = part[is_repeated]
+    if len(np.unique(repeated)) < FEWEST_PARTS:
         return 1.0
     residuals = np.zeros(len(labels))
     for space in np.unique(spaces):
@@ -77,12 +78,13 @@ def label_agreement(
         residuals[rows] = labels[rows] - _success_rate_around(
             points[rows], labels[rows], part[rows]
         )
-    sums = np.bincount(part[repeated], residuals[repeated], len(n_times))
-    squares = np.bincount(part[repeated], residuals[repeated] ** 2, len(n_times))
-    m = np.bincount(part[repeated], None, len(n_times))
+    residuals = residuals[is_repeated]
+    sums, squares, m = (
+        np.bincount(repeated, weights, len(n_times)) for weights in (residuals, residuals**2, None)
+    )
     products = sums**2 - squares  # of the residuals of different points of one part
     n_pairs = m * (m - 1.0)
-    variance = float((residuals[repeated] ** 2).mean())
+    variance = float((residuals**2).mean())
     rho = float(products.sum() / (n_pairs.sum() * variance))
     deviations = products / variance - rho * n_pairs
     error = float(np.sqrt((deviations**2).sum()) / n_pairs.sum())
@@ -343,27 +345,25 @@ class RadiusIndex(nn.Module):
         Raises
         ------
         ValueError
-            For other shapes. If `numbers` has another one, the points are partly added already.
+            For other shapes; nothing is added then.
         """
-        z = np.array(points, dtype=np.float32)  # copies, for torch needs writable arrays
-        y = np.array(labels, dtype=np.float32)
-        zeros = np.zeros(len(z), np.int64)
-        k = zeros if spaces is None else np.array(spaces, dtype=np.int64)
-        hashes = zeros if parts is None else np.array(parts, dtype=np.int64)
-        n = (len(z),)
-        if z.ndim != 2 or z.shape[1] != self.dim or {y.shape, k.shape, hashes.shape} != {n}:
-            wanted = f"points (n, {self.dim}) with n labels, n spaces and n parts"
-            actual = f"{z.shape}, {y.shape}, {k.shape} and {hashes.shape}"
+        z = torch.tensor(np.asarray(points, dtype=np.float32))
+        blocks = (self.labels[1], self.spaces, self.parts, torch.from_numpy(self.numbers))
+        columns = [
+            torch.tensor(np.zeros(len(z)) if values is None else np.asarray(values))
+            for values in (labels, spaces, parts, numbers)
+        ]
+        is_column = all(column.shape == z.shape[:1] for column in columns)
+        if z.ndim != 2 or z.size(1) != self.dim or not is_column:
+            wanted = f"points (n, {self.dim}) with n labels, n spaces, n parts and n numbers"
+            actual = ", ".join(str(tuple(values.shape)) for values in (z, *columns))
             raise ValueError(f"Expected {wanted}, got {actual}.")
-        total = int(self.total)
-        newest = slice(max(0, len(z) - self.capacity), None)
-        slots = (total + np.arange(len(z))[newest]) % self.capacity
-        self.points[:, slots] = torch.from_numpy(z[newest].T)
-        self.labels[1, slots] = torch.from_numpy(y[newest])
-        self.spaces[slots] = torch.from_numpy(k[newest])
-        self.parts[slots] = torch.from_numpy(hashes[newest])
-        self.numbers[slots] = 0 if numbers is None else np.asarray(numbers)[newest]
-        self.total.fill_(total + len(z))
+        newest = slice(-self.capacity, None)
+        slots = (int(self.total) + torch.arange(len(z)))[newest] % self.capacity
+        self.points[:, slots] = z[newest].T
+        for block, column in zip(blocks, columns, strict=True):
+            block[slots] = column[newest].to(block.dtype)
+        self.total.add_(len(z))
         self._count_repeats()
 
     def relabel(self, number: int, part: int, label: int | None) -> bool:
