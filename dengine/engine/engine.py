@@ -129,8 +129,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         A recipe, its name or a TOML file, for all settings that are not given as arguments. The
         reducer is part of the recipe: another `reducer` beside it is refused.
     model : Model, optional
-        A baseline, which decides by its own rule: of a policy only audit_rate, stops, label_within,
-        force_limits and shadow count then.
+        A baseline, no `ModelPrediction`; it decides by its own rule: of a policy only audit_rate,
+        stops, label_within, force_limits and shadow count then.
     executor : concurrent.futures.Executor, optional
         Where retrains run while the cell goes on. None: in the calling thread, between cycles;
         making the first engine of a process then takes about a second longer, since it loads what a

@@ -1,6 +1,6 @@
 """The two interfaces of a model: `Model` for baselines, `EngineModel` for the engine. The file also
-holds `Prediction`, what a model answers; `BaselineAdapter`, by which `as_engine_model` makes an
-`EngineModel` of a baseline; and `Exportable`, what a model hands to an exporter. dengine's own
+holds `Prediction`, what a model answers; `BaselineAdapter`, which makes an `EngineModel` of a
+baseline; and `Exportable`, what a model hands to an exporter. dengine's own
 `neighbours.ModelPrediction` implements both interfaces.
 
 Calls that must not raise into the cell go through `engine.guard.guarded`.
@@ -24,7 +24,6 @@ from ..decision.neighbours import CERTAIN, UNCERTAIN
 from ..decision.policy import Policy
 from ..errors import SettingError, shortened
 from ..limits import ForceLimits
-from ..recipe import Recipe
 from ..records import ACTIONS, Action, Arrays, Reason, State, TraceSpec
 from ..reducers.base import FitReport, Floats, Ints, StopRule
 from ..traces import clip_extremes
@@ -84,9 +83,6 @@ class EngineModel(ABC):
         What `DataEngine.model` shows: the model as its author knows it.
     name : str
         Shown in a status or a table.
-    description : str
-        The model and its numbers, the same at every start: a store compares it with the model that
-        made it.
     rule_is_stale : bool
         An update of the rule failed, so the model raises instead of predicting until the engine is
         opened again.
@@ -106,16 +102,8 @@ class EngineModel(ABC):
 
     user_model: Any
     name: str
-    description: str
     _decider: Decider | None = None
     _conditions: DecisionConditions | None = None
-
-    def effective_recipe(self, recipe: Recipe) -> Recipe:
-        """Return the recipe with this model's own settings in place of those that have no effect.
-
-        The default returns the recipe unchanged.
-        """
-        return recipe
 
     @abstractmethod
     def train(
@@ -357,37 +345,42 @@ class EngineModel(ABC):
         return True
 
 
-def as_engine_model(model: Model) -> EngineModel:
-    """Return the model itself if it is an `EngineModel`, else a baseline in a `BaselineAdapter`.
-
-    The baseline is not copied. Only the names of its methods are checked. Raises SettingError for a
-    class, and for an object that lacks a method of `Model`: fit, add, count, predict_interval or
-    decide.
-    """
-    if isinstance(model, EngineModel):
-        return model
-    if isinstance(model, type) or not isinstance(model, Model):
-        raise SettingError(
-            f"Expected a model with fit, add, count, predict_interval and decide, got {model!r}."
-        )
-    return BaselineAdapter(model)
-
-
 class BaselineAdapter(EngineModel):
     """Makes an `EngineModel` of a baseline, which decides by its own rule.
 
     An engine trains a deep copy of the baseline, see `successor`, so the present one goes on
-    answering.
+    answering. The baseline itself is not copied, and only the names of its methods are checked.
 
     Parameters
     ----------
     model : Model
-        A store compares only the name of its class, not its settings.
+
+    Attributes
+    ----------
+    description : str
+        Name of its class, the same at every start: a store compares it with the model that made it,
+        and not its settings.
+
+    Raises
+    ------
+    SettingError
+        For a class, for an object that lacks a method of `Model` (fit, add, count,
+        predict_interval or decide), and for a model of dengine's own.
     """
 
     keeps_references = False
 
     def __init__(self, model: Model) -> None:
+        if isinstance(model, type) or not isinstance(model, Model):
+            raise SettingError(
+                "Expected a model with fit, add, count, predict_interval and decide, "
+                f"got {model!r}."
+            )
+        if isinstance(model, EngineModel):
+            raise SettingError(
+                f"Expected a baseline, got a {type(model).__name__}; describe dengine's own model "
+                "by reducer=, policy= and recipe=."
+            )
         self.model = model
         self.user_model = model
         self.name = type(model).__name__

@@ -44,7 +44,7 @@ from ..decision.scripting import (
 )
 from ..errors import StoreError, expect
 from ..folds import content_hash, fold_of
-from ..recipe import NOVELTY, Recipe, describe_estimator
+from ..recipe import NOVELTY, Recipe
 from ..records import ACTIONS, REASONS, REPEATS, Arrays, Reason, State, TraceSpec, as_success
 from ..reducers import class_default, make_reducer
 from ..reducers.base import (
@@ -354,35 +354,6 @@ class ModelPrediction(EngineModel):
     @property
     def user_model(self) -> "ModelPrediction":  # an attribute would be a reference circle
         return self
-
-    @property
-    def description(self) -> str:  # type: ignore[override]  # the rule may change
-        reducer = describe_estimator(self.reducer)
-        classifier = describe_estimator(self.classifier)
-        return f"{reducer} under {classifier}, {self.folds} folds, {type(self.rule).__name__}"
-
-    def effective_recipe(self, recipe: Recipe) -> Recipe:
-        """Return a copy of a recipe with the settings that this model really has.
-
-        Radius, alpha, lower bound and interval are taken from the model's classifier, folds and
-        novelty from the model. For fewer than 2 folds 2 is written, the least that a Recipe takes.
-        All else, such as the reducer and the window, stays as in the recipe. Raises SettingError
-        for a setting that `Recipe` or `Policy` refuses.
-        """
-        classifier = self.classifier
-        policy = replace(
-            recipe.policy,
-            alpha=classifier.alpha,
-            lower_bound=classifier.lower_bound,
-            interval=classifier.interval,
-        )
-        return replace(
-            recipe,
-            radius=classifier.radius,
-            policy=policy,
-            folds=max(2, self.folds),
-            novelty=self.novelty,
-        )
 
     @property
     def n_spaces(self) -> int:
