@@ -439,7 +439,7 @@ def certify(
     Raises
     ------
     SettingError
-        For `stops`, alpha, the audit rate or a tolerance out of range.
+        For alpha or the audit rate out of range; `Policy` has checked `stops` and the tolerance.
     ValueError
         If more parts of a group are wrong than are in it.
 
@@ -455,8 +455,6 @@ def certify(
     audits, and without these it is 1; it is never below the share known to be good. A forgotten or
     overdue label counts as a wrong decision.
     """
-    expect(stops in ("all", "some"), "stops among all, some", stops)
-    expect(0.0 < tolerance < 1.0, "0 < tolerance < 1", tolerance, "0.05 tolerates 5 % of errors")
     lost_accepts = outcomes.forgotten_audited_accepts + outcomes.overdue_audited_accepts
     lost_rejects = outcomes.forgotten_audited_rejects + outcomes.overdue_audited_rejects
     o = replace(

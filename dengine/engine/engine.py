@@ -18,7 +18,7 @@ import time
 import weakref
 from collections.abc import Callable, Collection, Iterator
 from concurrent.futures import Executor
-from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Self, TypedDict, Unpack, overload
 
@@ -669,11 +669,12 @@ class DataEngine(AbstractContextManager["DataEngine"]):
             self._outbox.check_usable()
             with self._exclusive:
                 self._maker.set_trace_spec(spec)
-        with ExitStack() as ending:
-            ending.callback(self.flush, LONG_WAIT)
-            ending.enter_context(frozen_objects())
-            for index in range(cycles):
-                yield self._cycle(cell, index)
+        try:
+            with frozen_objects():
+                for index in range(cycles):
+                    yield self._cycle(cell, index)
+        finally:
+            self.flush(LONG_WAIT)
 
     def _cycle(self, cell: Cell, index: int) -> Cycle:
         """Have the cell insert one part, decide, do what the decision says, and report the outcome.

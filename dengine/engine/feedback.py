@@ -277,7 +277,7 @@ class Feedback:
 
     def count_new_labels(self, after: int) -> None:
         """Count the labels of the training window with a number above this one as new."""
-        self.new_labels = len(self._window.newer(after))
+        self.new_labels = self._window.count_newer(after)
 
     def give_labels_back(self, n_labels: int) -> None:
         """Count the labels of a retrain that was dropped as new again, so that the next one comes

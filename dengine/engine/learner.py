@@ -95,7 +95,8 @@ class Learner:
         after which a check without a report is overdue, and `policy_since` the first version under
         the policy in force. If there is a version, or at least IMPORTED labels (500), this also
         starts a thread that computes in advance for the next retrain (`precompute`). Raises
-        StoreError if the store cannot be read, and the other errors of `LiveModel.resume`.
+        StoreError if the store cannot be read, and the
+        other errors of `LiveModel.resume`.
         """
         version = self._store.versions.newest()
         reports = self._store.versions.retrains()
@@ -343,7 +344,10 @@ class Learner:
         note = self._start[2] if self._start is not None else ""
         if note:
             trained = replace(trained, reason=f"{trained.reason}; {note}")
-        self._candidate = Candidate(trained, self.live.newest, self.live.version, self._clock)
+        live = self.live
+        self._candidate = Candidate(
+            trained, live.newest, live.version, live.corrected_to, self._clock
+        )
         self._steps = self._see_through(self._candidate)
         return self._candidate
 
@@ -461,7 +465,7 @@ class Learner:
         version first. Without a model only the report is stored, and the number is the report's.
         Raises StoreError if the store is unavailable. With a store in memory it is kept there.
         """
-        report = candidate.complete_report(self.live.next_version, self.live.corrected_to)
+        report = candidate.complete_report(self.live.next_version)
         newest_seq = self._window.newest_seq
         state = None
         if candidate.model is not None:

@@ -253,10 +253,9 @@ class LiveModel:
         The decision leaves the set `overdue`. Returns whether it was in it. If True, the caller
         must have the rule rebuilt, because the rule has counted the decision as wrong.
         """
-        if decision_id not in self.overdue:
-            return False
+        was_overdue = decision_id in self.overdue
         self.overdue.discard(decision_id)
-        return True
+        return was_overdue
 
     def rebuild_rule(self) -> None:
         """Reset the rule, and update it with the stored outcomes of decisions since it began.

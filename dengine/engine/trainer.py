@@ -115,19 +115,21 @@ class TrainingWindow:
         """
         return LabelledTraces(*[column[self._first : self._end] for column in self._block])
 
-    def newer(self, seq: int) -> list[int]:
-        """Return the sequence numbers of the window's labels after this one, in ascending order."""
+    def count_newer(self, seq: int) -> int:
+        """Return how many labels of the window have a number above this one."""
         numbers = self._block[0][self._first : self._end]
-        newer: list[int] = numbers[np.searchsorted(numbers, seq, "right") :].tolist()
-        return newer
+        return len(numbers) - int(np.searchsorted(numbers, seq, "right"))
 
-    def row(self, seq: int) -> tuple[TraceArray, int, int]:
-        """Return trace (channels, samples), label and hash of the label of this number.
+    def row_after(self, seq: int) -> tuple[int, TraceArray, int, int] | None:
+        """Return the first label of the window with a number above this one; None without any.
 
-        That it is in the window is not checked.
+        It is the label's number, its trace (channels, samples), the label and its hash.
         """
-        i = int(np.searchsorted(self._block[0][: self._end], seq))
-        return self._block[1][i], int(self._block[2][i]), int(self._block[3][i])
+        i = self._end - self.count_newer(seq)
+        if i == self._end:
+            return None
+        numbers, traces, labels, hashes = self._block
+        return int(numbers[i]), traces[i], int(labels[i]), int(hashes[i])
 
 
 @dataclass(frozen=True)
