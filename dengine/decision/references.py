@@ -30,6 +30,7 @@ from torch import Tensor, nn
 FEWEST_PARTS = 20  # that came at least twice; fewer say nothing about agreement
 N_NEIGHBOURS = 30  # of other parts, whose labels say what is usual around a point
 SAMPLE = 3000  # newest points that are looked at: the work does not grow
+COLUMNS = ("points", "labels", "spaces", "parts", "numbers")  # of an index, by `column`
 CONFIDENCE = 1.645  # standard errors above the estimate: 95 %, one-sided
 
 
@@ -399,8 +400,7 @@ class RadiusIndex(nn.Module):
             self.labels[1, slot] = float(label)
             return True
         order = (int(self.total) - n + np.arange(n)) % self.capacity  # oldest first
-        names = ("points", "labels", "spaces", "parts", "numbers")
-        columns = [self.column(name)[order[order != slot]] for name in names]
+        columns = [self.column(name)[order[order != slot]] for name in COLUMNS]
         for block in (self.points, self.labels[1], self.spaces, self.parts, self.total):
             block.zero_()
         self.numbers[:] = 0
@@ -429,9 +429,8 @@ class RadiusIndex(nn.Module):
         `numbers` (of the labels) are (n,), in the order of the points. `agreement` (how strongly
         repeated labels of a part agree) and `total` (points ever added) have no dimension.
         """
-        names = ("labels", "spaces", "parts", "numbers")
         state = {"points": self.column("points").T.copy()}
-        state |= {name: self.column(name).copy() for name in names}
+        state |= {name: self.column(name).copy() for name in COLUMNS[1:]}
         return state | {name: getattr(self, name).numpy().copy() for name in ("agreement", "total")}
 
     @classmethod
@@ -448,8 +447,7 @@ class RadiusIndex(nn.Module):
         older = int(state["total"]) - n  # points that left
         index.total.fill_(older if capacity <= n else 0)
         order = (older + np.arange(n)) % max(n, 1)  # oldest first
-        columns = (state[name][order] for name in ("labels", "spaces", "parts", "numbers"))
-        index.add(state["points"].T[order], *columns)
+        index.add(state["points"].T[order], *(state[name][order] for name in COLUMNS[1:]))
         index.agreement.fill_(float(state["agreement"]))
         return index
 

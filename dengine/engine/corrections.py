@@ -12,13 +12,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-import numpy as np
-
 from ..decision.intervals import SORTING_GUARANTEES
 from ..decision.members import SAFE_MODES
 from ..decision.policy import Policy
-from ..errors import ReportError, SettingError, expect, listed
-from ..records import as_success
+from ..errors import ReportError, expect, listed
+from ..records import as_success, is_whole
 from ..store.outbox import Outbox
 from ..store.records import (
     POLICY_CHANGED,
@@ -275,11 +273,8 @@ class Corrections:
         Exception
             What a model raises that must be fitted again.
         """
-        if isinstance(version, bool) or not isinstance(version, int | np.integer):
-            raise SettingError(
-                f"Expected the number of a version, got {version!r}; "
-                "`store.versions.retrains()` lists them."
-            )
+        do = "`store.versions.retrains()` lists them"
+        expect(is_whole(version, -(2**63), 2**63 - 1), "the number of a version", version, do)
         self._bring_up_to_date()
         before = self._live.version
         pinned = self._live.pinned

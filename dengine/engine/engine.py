@@ -73,7 +73,7 @@ from .settings import (
     read_peers_trace_spec,
 )
 from .state import EngineState
-from .trainer import Clock, Limits, Retrainer, TrainingWindow
+from .trainer import Clock, Retrainer, TrainingWindow
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -241,8 +241,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         if store.product is not None:
             peers = Peers(self._outbox, self._live, window, clock)
         self._feedback = Feedback(self._outbox, self._live, window, self._settings, on_safe_mode)
-        limits = Limits(None if replaying else recipe.budget, recipe.max_steps)
-        retrainer = Retrainer(window, limits, executor, clock)
+        budget = None if replaying else recipe.budget
+        retrainer = Retrainer(window, budget, recipe.max_steps, executor, clock)
         self._learner = Learner(
             self._outbox, self._live, window, self._feedback, peers, retrainer, clock
         )
@@ -426,7 +426,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
                 return cls(
                     store=opened, **fill_from_peers(settings | {"seed": seed}, opened, allowed)
                 )
-            names = ("model", "trace", "executor", "replaying", "clock", "on_safe_mode")
+            names = ("model", "trace", *RunOptions.__annotations__)
             options = {name: settings.pop(name) for name in names if name in settings}
             recipe = settings.get("recipe")
             reducer = settings.get("reducer")

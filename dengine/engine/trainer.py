@@ -183,37 +183,6 @@ class TrainedOn:
 
 
 @dataclass(frozen=True)
-class Limits:
-    """Limits of a retrain; None is no limit.
-
-    Attributes
-    ----------
-    budget : float or None
-        Seconds of wall time.
-    max_steps : int or None
-        Optimiser steps.
-    reserve : float
-        Seconds of the budget that are kept for the last step and the work after it.
-    """
-
-    budget: float | None = None
-    max_steps: int | None = None
-    reserve: float = 0.0
-
-    def deadline(self, begin: float) -> float | None:
-        """Return the time after which a training begins no step, if it began at `begin`.
-
-        Both are in seconds by the same clock. It is after 70 % of the time budget, or when
-        `reserve` seconds of it are left if that is earlier, but not before 30 %. None without a
-        budget.
-        """
-        if self.budget is None:
-            return None
-        seconds = min(STEPS * self.budget, self.budget - self.reserve)
-        return begin + max(FEWEST_STEPS * self.budget, seconds)
-
-
-@dataclass(frozen=True)
 class Trained:
     """The outcome of a training.
 
@@ -266,7 +235,10 @@ class Retrainer:
     Parameters
     ----------
     window : TrainingWindow
-    limits : Limits
+    budget : float or None
+        Seconds of wall time of a retrain; None: no limit.
+    max_steps : int or None
+        Optimiser steps of a retrain; None: no limit.
     executor : concurrent.futures.Executor or None
         A `RestartableExecutor` that died or hangs is started again. Any other one is set to None
         when it died, hangs or takes no more work.
@@ -282,12 +254,14 @@ class Retrainer:
     def __init__(
         self,
         window: TrainingWindow,
-        limits: Limits,
+        budget: float | None,
+        max_steps: int | None,
         executor: Executor | None,
         clock: Clock = time.perf_counter,
     ) -> None:
         self.window = window
-        self.limits = limits
+        self.budget = budget
+        self.max_steps = max_steps
         self.executor = executor
         self.clock = clock
         self.future: Future[Trained] | None = None
@@ -295,9 +269,16 @@ class Retrainer:
         self._seq = np.zeros(0, dtype=np.int64)  # the labels that it was given
         self._last_seconds = deque([0.0], N_REMEMBERED)  # of the newest trainings
 
-    def _limits(self) -> Limits:
-        """Return the limits of the next training, with the reserve that the last ones needed."""
-        return replace(self.limits, reserve=max(self._last_seconds))
+    def _step_seconds(self) -> float | None:
+        """Return the seconds after which the next training begins no step; None without a budget.
+
+        They are 70 % of the time budget, or less if the newest trainings took longer for their last
+        step and the work after it, but not less than 30 %.
+        """
+        if self.budget is None:
+            return None
+        seconds = min(STEPS * self.budget, self.budget - max(self._last_seconds))
+        return max(FEWEST_STEPS * self.budget, seconds)
 
     def train(self, current: EngineModel, begin: float) -> Trained:
         """Train a successor of the current model in this thread, and return the outcome.
@@ -310,7 +291,8 @@ class Retrainer:
         next. This thread then has one torch thread.
         """
         data = self.window.snapshot()
-        trained = train_candidate(current.successor(), data, self._limits(), self.clock)
+        limits = (self._step_seconds(), self.max_steps)
+        trained = train_candidate(current.successor(), data, *limits, self.clock)
         self._last_seconds.append(trained.last_seconds)
         return replace(trained, begin=begin)
 
@@ -328,7 +310,8 @@ class Retrainer:
         data = self.window.snapshot()
         if not self._began:
             log.info("the first retrain begins, on %s", counted(len(data.seq), "label"))
-        arguments = (current.successor(), data, self._limits(), self.clock)
+        limits = (self._step_seconds(), self.max_steps)
+        arguments = (current.successor(), data, *limits, self.clock)
         try:
             self.future = executor.submit(train_candidate, *arguments)
         except RuntimeError as error:
@@ -429,12 +412,17 @@ class Retrainer:
 
 
 def train_candidate(
-    successor: EngineModel, data: LabelledTraces, limits: Limits, clock: Clock
+    successor: EngineModel,
+    data: LabelledTraces,
+    step_seconds: float | None,
+    max_steps: int | None,
+    clock: Clock,
 ) -> Trained:
     """Train a model on labelled traces and return the outcome.
 
     The outcome has the model, a reason in words, the number of steps, the duration, and the numbers
-    of the labels. `successor` is the model, which this changes in place. Any exception, a window
+    of the labels. `successor` is the model, which this changes in place. No step begins after
+    `step_seconds`, and after `max_steps` steps; None is no limit. Any exception, a window
     without traces, and a defect of the trained model give an outcome without a model, whose reason
     begins with "dropped: ". A training that reaches a limit ends early and is accepted; its reason
     says so if the time budget ended it before its last step, and has the note of the model's report
@@ -445,7 +433,8 @@ def train_candidate(
     torch.set_num_threads(1)  # it holds for the present thread only
     guarded(NOT_PRECOMPUTED, successor.warm_up)
     begin = clock()
-    stop = StopRule(limits.deadline(begin), limits.max_steps, clock)
+    deadline = None if step_seconds is None else begin + step_seconds
+    stop = StopRule(deadline, max_steps, clock)
     model: EngineModel | None = None
     n_steps = 0
     try:
