@@ -110,11 +110,16 @@ def failure_bound(n: int, n_bad: int, alpha: float, propensity: float = 1.0) -> 
         If n_bad is not between 0 and n.
     """
     expect(0.0 < alpha < 1.0, "0 < alpha < 1", alpha, "0.05 asks for 95 % confidence")
-    do = "0.02 looks at one part in fifty"
-    expect(0.0 <= propensity <= 1.0, "0 <= propensity <= 1", propensity, do)
+    expect(
+        0.0 <= propensity <= 1.0,
+        "0 <= propensity <= 1",
+        propensity,
+        "0.02 looks at one part in fifty",
+    )
     if not 0 <= n_bad <= n:
-        actual = f"n_bad = {n_bad} of n = {n}"
-        raise ValueError(f"Expected 0 <= n_bad <= n, got {actual}; count each part once.")
+        raise ValueError(
+            f"Expected 0 <= n_bad <= n, got n_bad = {n_bad} of n = {n}; count each part once."
+        )
     enough = math.log(1.0 / alpha)
     if propensity == 0.0 or log_evidence(n, n_bad, 1.0, propensity) < enough:
         return 1.0

@@ -319,8 +319,10 @@ def _as_counts(n_success: ArrayLike, n_failure: ArrayLike) -> tuple[FloatArray, 
     successes = np.asarray(n_success, dtype=np.float64)
     failures = np.asarray(n_failure, dtype=np.float64)
     if successes.shape != failures.shape:
-        actual = f"{successes.shape} successes and {failures.shape} failures"
-        raise ValueError(f"Expected counts of one shape, got {actual}.")
+        raise ValueError(
+            f"Expected counts of one shape, got {successes.shape} successes and {failures.shape} "
+            "failures."
+        )
     if np.any(successes < 0) or np.any(failures < 0):
         raise ValueError("Expected counts of zero or more, got a negative one.")
     return successes, failures

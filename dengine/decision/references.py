@@ -356,9 +356,11 @@ class RadiusIndex(nn.Module):
         ]
         is_column = all(column.shape == z.shape[:1] for column in columns)
         if z.ndim != 2 or z.size(1) != self.dim or not is_column:
-            wanted = f"points (n, {self.dim}) with n labels, n spaces, n parts and n numbers"
-            actual = ", ".join(str(tuple(values.shape)) for values in (z, *columns))
-            raise ValueError(f"Expected {wanted}, got {actual}.")
+            shapes = ", ".join(str(tuple(values.shape)) for values in (z, *columns))
+            raise ValueError(
+                f"Expected points (n, {self.dim}) with n labels, n spaces, n parts and n numbers, "
+                f"got {shapes}."
+            )
         newest = slice(-self.capacity, None)
         slots = (int(self.total) + torch.arange(len(z)))[newest] % self.capacity
         self.points[:, slots] = z[newest].T

@@ -430,9 +430,12 @@ class ModelPrediction(EngineModel):
         X = clip_extremes(X)
         y = y.astype(np.int64)
         is_one_part = len(X) >= MANY_OF_ONE and (hashes == hashes[0]).all()
-        actual = f"{len(X)} of one: all have its number, or are the same to 1/65536 of their unit"
-        do = "check part=, the sensor and the unit"
-        expect(not is_one_part, "traces of several parts", actual, do)
+        expect(
+            not is_one_part,
+            "traces of several parts",
+            f"{len(X)} of one: all have its number, or are the same to 1/65536 of their unit",
+            "check part=, the sensor and the unit",
+        )
         folds = fold_of(hashes, self.n_spaces)
         points = self.spaces.train(X, y, folds, stop, numbers)
         self.trace_shape = X.shape[1:]
