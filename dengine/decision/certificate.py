@@ -479,10 +479,17 @@ def certify(
     elif audit_rate == 0.0:
         accepted = _bound_outcomes(o.accepted, 0, 0, o.accepted, 0.0, alpha)
     else:
-        accepts = o.accepted, o.audited_accepts, o.audited_accepts_bad, o.false_accepts
-        accepted = _bound_audits(*accepts, audit_rate, (1.0 - share) * alpha)
-    rejects = o.rejected, o.audited_rejects, o.audited_rejects_good, o.false_rejects
-    rejected = _bound_audits(*rejects, audit_rate, alpha)
+        accepted = _bound_audits(
+            o.accepted,
+            o.audited_accepts,
+            o.audited_accepts_bad,
+            o.false_accepts,
+            audit_rate,
+            (1.0 - share) * alpha,
+        )
+    rejected = _bound_audits(
+        o.rejected, o.audited_rejects, o.audited_rejects_good, o.false_rejects, audit_rate, alpha
+    )
     # 1 - 0.95 is 0.05000000000000004.
     return Certificate(alpha, round(tolerance, 12), accepted, rejected)
 

@@ -309,10 +309,12 @@ class MemberEvidence(nn.Module):
         of their detector is 25 or more, see `observe`) and one of the two thresholds is not
         `CLOSED`. At the end of any safe mode this sum restarts at 0.
         """
-        side = Detector.ACCEPTED_PARTS.value
-        self.count_outcome(side, lower, not success, predicted, inclusion_probability)
-        side = Detector.REJECTED_PARTS.value
-        self.count_outcome(side, 1.0 - upper, success, predicted, inclusion_probability)
+        self.count_outcome(
+            Detector.ACCEPTED_PARTS.value, lower, not success, predicted, inclusion_probability
+        )
+        self.count_outcome(
+            Detector.REJECTED_PARTS.value, 1.0 - upper, success, predicted, inclusion_probability
+        )
         safe_mode = int(self.safe_mode.item())
         if safe_mode == SafeMode.NONE.value:
             return

@@ -218,7 +218,6 @@ class Feedback:
         later.
         """
         decision = stored.decision
-        version = self._live.version
         number = self._outbox.number_label()
         point = None
         n_unreported = None  # the rule is not updated
@@ -227,15 +226,14 @@ class Feedback:
                 n_unreported = self._n_unreported - self._was_unreported(stored)
                 self._n_unreported = 0
             point = self._live.learn(stored, success, number, n_unreported)
-        overdue_to = self._live.overdue_to
         label = NewLabel(
             decision.id,
             success,
             source,
-            version,
+            self._live.version,
             point,
             n_unreported or 0,
-            overdue_to=overdue_to,
+            overdue_to=self._live.overdue_to,
             seq=number,
         )
         self._outbox.record_labels([(stored, label)])

@@ -111,10 +111,8 @@ class EngineSettings:
         must be imported for a default of the recipe, and cannot be.
         """
         texts = {"recipe": self.recipe.to_toml(), "seed": str(self.seed), "dengine": __version__}
-        if self.model is not None:
-            texts["model"] = self.model
-        if self.described is not None:
-            texts["described"] = self.described
+        objects = {"model": self.model, "described": self.described}
+        texts |= {name: text for name, text in objects.items() if text is not None}
         if self.trace is not None:
             texts["trace"] = json.dumps(asdict(self.trace))
         numbers = {

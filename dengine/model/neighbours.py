@@ -194,12 +194,11 @@ def structure_of(eager: nn.Module) -> tuple[Any, ...]:
     limits is left out, so that their number makes no difference. The class itself is in the key,
     not its name: a notebook cell that is run again defines another class.
     """
-    parts = [
+    return tuple(
         (path, type(module), _as_key(attributes_of(module)))
         for path, module in eager.named_modules(remove_duplicate=False)
         if not isinstance(module, ForceLimitsGate)  # limits may change in number
-    ]
-    return tuple(parts)
+    )
 
 
 def _as_key(value: object) -> object:
@@ -232,8 +231,7 @@ def compiled(eager: Decider, warm_up_shape: tuple[int, ...]) -> Any:
     submodules = dict(module.named_modules(remove_duplicate=False))
     for path, submodule in eager.named_modules(remove_duplicate=False):
         for name, value in attributes_of(submodule).items():
-            is_container = isinstance(value, list | tuple | dict)
-            if isinstance(value, Tensor) or (is_container and has_tensor(value)):
+            if has_tensor(value):
                 setattr(submodules[path], name, value)
     return module
 
@@ -926,8 +924,7 @@ def repeats_note(traces: Floats, parts: NDArray[np.int64]) -> str:
     n_repeats = near_repeats(traces, parts)
     if n_repeats <= MANY_REPEATS:
         return ""
-    n_compared = min(len(traces), NEWEST)
     return (
-        f"{n_repeats} of the newest {n_compared} {REPEATS}: "
+        f"{n_repeats} of the newest {min(len(traces), NEWEST)} {REPEATS}: "
         "if parts come twice, give their numbers (part=)"
     )
