@@ -110,11 +110,16 @@ def failure_bound(n: int, n_bad: int, alpha: float, propensity: float = 1.0) -> 
         If n_bad is not between 0 and n.
     """
     expect(0.0 < alpha < 1.0, "0 < alpha < 1", alpha, "0.05 asks for 95 % confidence")
-    do = "0.02 looks at one part in fifty"
-    expect(0.0 <= propensity <= 1.0, "0 <= propensity <= 1", propensity, do)
+    expect(
+        0.0 <= propensity <= 1.0,
+        "0 <= propensity <= 1",
+        propensity,
+        "0.02 looks at one part in fifty",
+    )
     if not 0 <= n_bad <= n:
-        actual = f"n_bad = {n_bad} of n = {n}"
-        raise ValueError(f"Expected 0 <= n_bad <= n, got {actual}; count each part once.")
+        raise ValueError(
+            f"Expected 0 <= n_bad <= n, got n_bad = {n_bad} of n = {n}; count each part once."
+        )
     enough = math.log(1.0 / alpha)
     if propensity == 0.0 or log_evidence(n, n_bad, 1.0, propensity) < enough:
         return 1.0
@@ -439,7 +444,7 @@ def certify(
     Raises
     ------
     SettingError
-        For `stops`, alpha, the audit rate or a tolerance out of range.
+        For alpha or the audit rate out of range; `Policy` has checked `stops` and the tolerance.
     ValueError
         If more parts of a group are wrong than are in it.
 
@@ -455,8 +460,6 @@ def certify(
     audits, and without these it is 1; it is never below the share known to be good. A forgotten or
     overdue label counts as a wrong decision.
     """
-    expect(stops in ("all", "some"), "stops among all, some", stops)
-    expect(0.0 < tolerance < 1.0, "0 < tolerance < 1", tolerance, "0.05 tolerates 5 % of errors")
     lost_accepts = outcomes.forgotten_audited_accepts + outcomes.overdue_audited_accepts
     lost_rejects = outcomes.forgotten_audited_rejects + outcomes.overdue_audited_rejects
     o = replace(
@@ -476,10 +479,17 @@ def certify(
     elif audit_rate == 0.0:
         accepted = _bound_outcomes(o.accepted, 0, 0, o.accepted, 0.0, alpha)
     else:
-        accepts = o.accepted, o.audited_accepts, o.audited_accepts_bad, o.false_accepts
-        accepted = _bound_audits(*accepts, audit_rate, (1.0 - share) * alpha)
-    rejects = o.rejected, o.audited_rejects, o.audited_rejects_good, o.false_rejects
-    rejected = _bound_audits(*rejects, audit_rate, alpha)
+        accepted = _bound_audits(
+            o.accepted,
+            o.audited_accepts,
+            o.audited_accepts_bad,
+            o.false_accepts,
+            audit_rate,
+            (1.0 - share) * alpha,
+        )
+    rejected = _bound_audits(
+        o.rejected, o.audited_rejects, o.audited_rejects_good, o.false_rejects, audit_rate, alpha
+    )
     # 1 - 0.95 is 0.05000000000000004.
     return Certificate(alpha, round(tolerance, 12), accepted, rejected)
 

@@ -213,7 +213,8 @@ def classes_of(y: ArrayLike) -> NDArray[Any]:
     check_classification_targets(y)
     classes = np.unique(np.asarray(y))
     if len(classes) > 2:
-        problem = "Only binary classification is supported. The type of the target is multiclass"
-        wanted = "expected two classes, 1 = success and 0 = failure"
-        raise ValueError(f"{problem}: {wanted}, got {len(classes)}.")
+        raise ValueError(
+            "Only binary classification is supported. The type of the target is multiclass: "
+            f"expected two classes, 1 = success and 0 = failure, got {len(classes)}."
+        )
     return classes

@@ -94,9 +94,7 @@ def wilson_interval(n_success: ArrayLike, n_failure: ArrayLike, alpha: float = 0
     ----------
     Wilson (1927), JASA 22(158); the paper's equation for the Wilson score interval.
     """
-    z = normal_quantile(alpha)
-    successes, failures = _as_counts(n_success, n_failure)
-    return _as_floats(*wilson_limits(np, successes, failures, z))
+    return _normal_interval(wilson_limits, n_success, n_failure, alpha)
 
 
 def wald_interval(n_success: ArrayLike, n_failure: ArrayLike, alpha: float = 0.05) -> Bounds:
@@ -122,9 +120,7 @@ def wald_interval(n_success: ArrayLike, n_failure: ArrayLike, alpha: float = 0.0
     ----------
     Brown, Cai and DasGupta (2001), Statistical Science 16(2).
     """
-    z = normal_quantile(alpha)
-    successes, failures = _as_counts(n_success, n_failure)
-    return _as_floats(*wald_limits(np, successes, failures, z))
+    return _normal_interval(wald_limits, n_success, n_failure, alpha)
 
 
 binomial_interval = wald_interval
@@ -286,6 +282,14 @@ def scalar_interval(
     return float(lower), float(upper)
 
 
+def _normal_interval(
+    limits: Callable[..., Bounds], n_success: ArrayLike, n_failure: ArrayLike, alpha: float
+) -> Bounds:
+    """Return (lower, upper) by `wilson_limits` or `wald_limits`, at the error level alpha."""
+    z = normal_quantile(alpha)
+    return _as_floats(*limits(np, *_as_counts(n_success, n_failure), z))
+
+
 def _beta_interval(
     n_success: ArrayLike, n_failure: ArrayLike, alpha: float, prior: float, other_prior: float
 ) -> Bounds:
@@ -315,8 +319,10 @@ def _as_counts(n_success: ArrayLike, n_failure: ArrayLike) -> tuple[FloatArray, 
     successes = np.asarray(n_success, dtype=np.float64)
     failures = np.asarray(n_failure, dtype=np.float64)
     if successes.shape != failures.shape:
-        actual = f"{successes.shape} successes and {failures.shape} failures"
-        raise ValueError(f"Expected counts of one shape, got {actual}.")
+        raise ValueError(
+            f"Expected counts of one shape, got {successes.shape} successes and {failures.shape} "
+            "failures."
+        )
     if np.any(successes < 0) or np.any(failures < 0):
         raise ValueError("Expected counts of zero or more, got a negative one.")
     return successes, failures

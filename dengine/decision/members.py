@@ -309,10 +309,12 @@ class MemberEvidence(nn.Module):
         of their detector is 25 or more, see `observe`) and one of the two thresholds is not
         `CLOSED`. At the end of any safe mode this sum restarts at 0.
         """
-        side = Detector.ACCEPTED_PARTS.value
-        self.count_outcome(side, lower, not success, predicted, inclusion_probability)
-        side = Detector.REJECTED_PARTS.value
-        self.count_outcome(side, 1.0 - upper, success, predicted, inclusion_probability)
+        self.count_outcome(
+            Detector.ACCEPTED_PARTS.value, lower, not success, predicted, inclusion_probability
+        )
+        self.count_outcome(
+            Detector.REJECTED_PARTS.value, 1.0 - upper, success, predicted, inclusion_probability
+        )
         safe_mode = int(self.safe_mode.item())
         if safe_mode == SafeMode.NONE.value:
             return
@@ -376,33 +378,26 @@ class MemberEvidence(nn.Module):
     def step_detector(self, detector: int, step: float, times: int) -> None:
         """Add `step` to a CUSUM `times` times; start the safe mode if the sum reaches its limit.
 
-        Nothing happens if `times` is 0. A CUSUM is the running sum of a drift detector. An alarm
-        sets the sums of all detectors to 0.
-        """
-        if times > 0 and self.add_steps(detector, step, times) >= self.alarm_limits[detector]:
-            self.raise_alarm(detector)
+        A CUSUM is the running sum of a drift detector; `detector` is its position in
+        `detector_sums`, which is changed in place. Before each step a sum below 0 is taken as 0, so
+        the new sum may be one step below 0. If `times` is above 1, `step` must be negative: only
+        the new sum is compared with the limit. Nothing happens if `times` is 0 or less.
 
-    def add_steps(self, detector: int, step: float, times: int) -> float:
-        """Add `step` to the sum of a detector `times` times, once or more, and return the new sum.
-
-        `detector` is its position in `detector_sums`, which is changed in place. Before each step a
-        sum below 0 is taken as 0, so the new sum may be one step below 0. If `times` is above 1,
-        `step` must be negative: the caller compares only the new sum with the limit.
+        An alarm starts the safe mode (both sides are closed), or starts it anew during one, and
+        sets the sums of all detectors to 0. During a safe mode the reason stays that stands first
+        in `SafeMode`: a side that has not shown its tolerance yet stays the reason when novel
+        traces come on top.
         """
+        if times <= 0:
+            return
         before = float(self.detector_sums[detector].item())
         total = max(before + (times - 1) * step, 0.0) + step
         self.detector_sums[detector].fill_(total)
-        return total
-
-    def raise_alarm(self, detector: int) -> None:
-        """Start the safe mode (both sides are closed) for a detector, or start it anew during one.
-
-        An alarm during a safe mode keeps the reason that stands first in `SafeMode`: a side that
-        has not shown its tolerance yet stays the reason when novel traces come on top.
-        """
-        safe_mode = int(self.safe_mode.item())
-        reason = SafeMode.ACCEPTED_PARTS.value + detector
-        self.start_safe_mode(reason if safe_mode == SafeMode.NONE.value else min(safe_mode, reason))
+        if total >= self.alarm_limits[detector]:
+            safe_mode = int(self.safe_mode.item())
+            reason = SafeMode.ACCEPTED_PARTS.value + detector
+            is_first = safe_mode == SafeMode.NONE.value
+            self.start_safe_mode(reason if is_first else min(safe_mode, reason))
 
     def start_safe_mode(self, safe_mode: int) -> None:
         """Accept and reject nothing until the outcomes of parts from now on show recovery.

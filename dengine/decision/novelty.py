@@ -160,14 +160,6 @@ class NoveltyGate(nn.Module):
         # Two calls, for aminmax takes half as long again as both.
         return torch.cat([pieces.amin(-1), pieces.amax(-1), logs], -1).flatten(-2)
 
-    def stretch_lengths(self) -> list[int]:
-        """Return how many samples each of the 2*S + 3 roughnesses of a channel is taken over.
-
-        The order is that of `plain_features`.
-        """
-        # Of the segments first and second differences, then three of brief stretches.
-        return [*2 * self.segments * [self.length], 2 * self.brief, self.brief, self.brief]
-
     def roughness(self, x: Tensor, length: int, stride: int) -> Tensor:
         """Return the norm of each stretch of `length` values of x (..., T), shape (..., n).
 
@@ -272,7 +264,9 @@ def _noise_floor(gate: NoveltyGate, x: Tensor) -> Tensor:
     steps = torch.zeros(x.size(1))
     if n_samples > 1:
         steps = torch.linalg.vector_norm(torch.diff(x), dim=2).median(0).values
-    lengths = torch.tensor(gate.stretch_lengths())
+    # Of the segments first and second differences, then three of brief stretches.
+    brief = [2 * gate.brief, gate.brief, gate.brief]
+    lengths = torch.tensor([*2 * gate.segments * [gate.length], *brief])
     return (0.05 * (lengths / n_samples).sqrt() * steps[:, None]).clamp(min=1e-12)
 
 
@@ -342,7 +336,7 @@ def _standardise(features: Tensor) -> tuple[Tensor, Tensor]:
     ordered = np.partition(features.numpy().T, (n_outer, n - 1 - n_outer), 1)  # (P, n)
     low = torch.from_numpy(ordered[:, n_outer])
     high = torch.from_numpy(ordered[:, -1 - n_outer])
-    inner = torch.minimum(torch.maximum(features, low), high)
+    inner = features.clamp(low, high)
     mean = inner.mean(0)
     deviation = inner.std(0, unbiased=False)
     floor = 1e-2 * deviation.median() + 1e-5 * mean.abs() + 1e-12
@@ -356,11 +350,8 @@ def _find_same(traces: NDArray[np.float32], parts: NDArray[np.int64] | None) -> 
     is (n, n) bool, with a diagonal of True. The second counts the traces that are not the same as
     an earlier one. If `parts` is None, only equal traces are the same.
     """
-    for samples in (traces[..., ::16], traces):  # a few samples tell most apart
-        numbers: dict[bytes, int] = {}
-        content = np.array([numbers.setdefault(x.tobytes(), len(numbers)) for x in samples])
-        if len(numbers) == len(traces):
-            break
+    numbers: dict[bytes, int] = {}
+    content = np.array([numbers.setdefault(x.tobytes(), len(numbers)) for x in traces])
     part = content if parts is None else parts
     same_part = part[:, None] == part
     same = (content[:, None] == content) | same_part

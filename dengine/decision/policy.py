@@ -119,15 +119,22 @@ class Policy:
         is_text = isinstance(self.guarantee, str)
         expect(is_text, "a guarantee's name, or module:Class as text", self.guarantee)
         normal_quantile(self.alpha)
-        do = "0.95 tolerates 5 % of errors"
-        expect(0.5 < self.lower_bound < 1.0, "0.5 < lower_bound < 1", self.lower_bound, do)
+        expect(
+            0.5 < self.lower_bound < 1.0,
+            "0.5 < lower_bound < 1",
+            self.lower_bound,
+            "0.95 tolerates 5 % of errors",
+        )
         has_interval = isinstance(self.interval, str) and self.interval in INTERVALS
         expect(has_interval, f"an interval among {', '.join(INTERVALS)}", self.interval)
-        do = "0.02 checks one part in fifty"
-        expect(0.0 <= self.audit_rate <= 1.0, "0 <= audit_rate <= 1", self.audit_rate, do)
+        expect(
+            0.0 <= self.audit_rate <= 1.0,
+            "0 <= audit_rate <= 1",
+            self.audit_rate,
+            "0.02 checks one part in fifty",
+        )
         has_rule = ":" in self.guarantee or self.guarantee in RULES
-        wanted = f"a guarantee among {', '.join(RULES)}, or module:Class"
-        expect(has_rule, wanted, self.guarantee)
+        expect(has_rule, f"a guarantee among {', '.join(RULES)}, or module:Class", self.guarantee)
         choices = get_args(Stops)
         expect(self.stops in choices, f"stops {' or '.join(choices)}", self.stops)
         expect(isinstance(self.shadow, bool), "shadow to be True or False", self.shadow)
@@ -153,8 +160,11 @@ class Policy:
         limits: Any = tuple(
             ForceLimits.parse(item) if isinstance(item, str) else item for item in given
         )
-        wanted = "force_limits, a list of ForceLimits or of their texts"
-        expect(all(isinstance(item, ForceLimits) for item in limits), wanted, self.force_limits)
+        expect(
+            all(isinstance(item, ForceLimits) for item in limits),
+            "force_limits, a list of ForceLimits or of their texts",
+            self.force_limits,
+        )
         return limits  # type: ignore[no-any-return]
 
     def _checked_prices(self) -> tuple[float, float, float]:
@@ -163,15 +173,18 @@ class Policy:
         Raises SettingError if they are not three finite numbers above 0, or if an error costs no
         more than two checks.
         """
-        prices = (0.0, 0.0, 0.0)
-        has_three = isinstance(self.prices, tuple | list) and len(self.prices) == 3
-        if has_three and all(map(is_number, self.prices)):
-            check, escape, false_reject = self.prices
-            prices = (float(check), float(escape), float(false_reject))
-        is_valid = 0.0 < 2.0 * prices[0] < min(prices[1:]) and max(prices) < math.inf
-        wanted = "prices of a check, an escape and a false reject, errors above two checks"
-        expect(is_valid, wanted, self.prices, "as in 5,120,47.5")
-        return prices
+        given = self.prices if isinstance(self.prices, tuple | list) else ()
+        prices = [float(price) for price in given if is_number(price)]
+        is_valid = len(prices) == len(given) == 3
+        is_valid = is_valid and 0.0 < 2.0 * prices[0] < min(prices[1:]) and max(prices) < math.inf
+        expect(
+            is_valid,
+            "prices of a check, an escape and a false reject, errors above two checks",
+            self.prices,
+            "as in 5,120,47.5",
+        )
+        check, escape, false_reject = prices
+        return check, escape, false_reject
 
     def to_values(self) -> dict[str, Any]:
         """Return every setting by its name; the force limits are one text, "none" without any."""
@@ -273,8 +286,9 @@ class Policy:
         else:
             rule_class = import_class(self.guarantee)
         if not issubclass(rule_class, DecisionRule):
-            wanted = "Expected a subclass of DecisionRule as guarantee"
-            raise SettingError(f"{wanted}, {self.guarantee} is none.")
+            raise SettingError(
+                f"Expected a subclass of DecisionRule as guarantee, {self.guarantee} is none."
+            )
         options: dict[str, Any] = {}
         if issubclass(rule_class, member_rules.PricedRule):
             options["tolerances"] = self.tolerances
@@ -283,8 +297,9 @@ class Policy:
         try:
             rule: DecisionRule = rule_class(self.alpha, self.lower_bound, self.interval, **options)
         except TypeError as error:
-            wanted = f"Expected {self.guarantee} to take alpha, lower_bound and interval"
-            raise SettingError(f"{wanted}: {error}.") from error
+            raise SettingError(
+                f"Expected {self.guarantee} to take alpha, lower_bound and interval: {error}."
+            ) from error
         return rule
 
     def certificate(self, outcomes: Outcomes) -> Certificate:

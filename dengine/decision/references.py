@@ -30,7 +30,7 @@ from torch import Tensor, nn
 FEWEST_PARTS = 20  # that came at least twice; fewer say nothing about agreement
 N_NEIGHBOURS = 30  # of other parts, whose labels say what is usual around a point
 SAMPLE = 3000  # newest points that are looked at: the work does not grow
-FILTER_SIZE = 2**16  # bits, a power of two
+COLUMNS = ("points", "labels", "spaces", "parts", "numbers")  # of an index, by `column`
 CONFIDENCE = 1.645  # standard errors above the estimate: 95 %, one-sided
 
 
@@ -69,8 +69,9 @@ def label_agreement(
     spaces = spaces[-SAMPLE:]
     parts = parts[-SAMPLE:]
     _, part, n_times = np.unique(parts, return_inverse=True, return_counts=True)
-    repeated = (n_times[part] > 1) & (parts != 0)
-    if len(np.unique(part[repeated])) < FEWEST_PARTS:
+    is_repeated = (n_times[part] > 1) & (parts != 0)
+    repeated = part[is_repeated]
+    if len(np.unique(repeated)) < FEWEST_PARTS:
         return 1.0
     residuals = np.zeros(len(labels))
     for space in np.unique(spaces):
@@ -78,12 +79,13 @@ def label_agreement(
         residuals[rows] = labels[rows] - _success_rate_around(
             points[rows], labels[rows], part[rows]
         )
-    sums = np.bincount(part[repeated], residuals[repeated], len(n_times))
-    squares = np.bincount(part[repeated], residuals[repeated] ** 2, len(n_times))
-    m = np.bincount(part[repeated], None, len(n_times))
+    residuals = residuals[is_repeated]
+    sums, squares, m = (
+        np.bincount(repeated, weights, len(n_times)) for weights in (residuals, residuals**2, None)
+    )
     products = sums**2 - squares  # of the residuals of different points of one part
     n_pairs = m * (m - 1.0)
-    variance = float((residuals[repeated] ** 2).mean())
+    variance = float((residuals**2).mean())
     rho = float(products.sum() / (n_pairs.sum() * variance))
     deviations = products / variance - rho * n_pairs
     error = float(np.sqrt((deviations**2).sum()) / n_pairs.sum())
@@ -135,16 +137,12 @@ class RadiusIndex(nn.Module):
         Embedding space of each point.
     parts : Tensor of int64, shape (capacity,)
         Hash of each point's part; 0 for an unknown part.
-    first : Tensor of int64, shape (capacity,)
-        First slot that holds a point of the same part.
     repeats : Tensor of int64, shape ()
-        Number of points whose part is in an earlier slot.
+        Number of points of known parts, less the number of these parts.
     agreement : Tensor of float64, shape ()
         How strongly repeated labels of a part agree, see `label_agreement`.
     total : Tensor of int64, shape ()
         Number of points ever added.
-    part_filter : Tensor of bool, shape (FILTER_SIZE,)
-        Whether a part whose hash has these last bits may be in `parts`.
     numbers : array of int64, shape (capacity,)
         Sequence number of each point's label, 0 if there is none.
     """
@@ -153,27 +151,22 @@ class RadiusIndex(nn.Module):
     labels: Tensor
     spaces: Tensor
     parts: Tensor
-    first: Tensor
     repeats: Tensor
     agreement: Tensor
     total: Tensor
-    part_filter: Tensor
 
     def __init__(self, dim: int, capacity: int = 10_000) -> None:
         super().__init__()
         self.dim = dim
         self.capacity = capacity
-        self.filter_mask = FILTER_SIZE - 1
         buffers = {
             "points": torch.zeros(dim, capacity),
             "labels": torch.ones(2, capacity),
             "spaces": torch.zeros(capacity, dtype=torch.int64),
             "parts": torch.zeros(capacity, dtype=torch.int64),
-            "first": torch.arange(capacity),
             "repeats": torch.zeros((), dtype=torch.int64),
             "agreement": torch.ones((), dtype=torch.float64),
             "total": torch.zeros((), dtype=torch.int64),
-            "part_filter": torch.zeros(FILTER_SIZE, dtype=torch.bool),
         }
         for name, buffer in buffers.items():
             self.register_buffer(name, buffer)
@@ -231,33 +224,15 @@ class RadiusIndex(nn.Module):
         self.points[:, slot] = point
         self.labels[1, slot] = label
         self.spaces[slot] = space
-        self.total.fill_(total + 1)
-        self.set_part(slot, part)
-
-    @torch.jit.export
-    def set_part(self, slot: int, part: int) -> None:
-        """Replace the part of the point at a position (slot) by the hash `part`; 0: unknown.
-
-        `first` (for each point the first slot with a point of the same part) and `repeats` (the
-        number of points whose part is in an earlier slot) are updated for the points of the old and
-        of the new part. The new part is added to `part_filter`, which says what parts may be in the
-        index; the old one stays there.
-        """
-        leaving = int(self.parts[slot].item())
-        if leaving != 0 and int(self.repeats.item()) > 0:
-            same = self.parts == leaving
-            if int(same.sum().item()) > 1:  # the other points of the leaving part stay together
-                same[slot] = False
-                self.first.masked_fill_(same, int(same.nonzero()[0].item()))
-                self.repeats.sub_(1)
+        self.repeats.sub_(int(self.shares_part(slot)))
         self.parts[slot] = part
-        self.first[slot] = slot
-        if part != 0:
-            self.part_filter[part & self.filter_mask] = True
-            same = self.parts == part
-            if int(same.sum().item()) > 1:
-                self.first.masked_fill_(same, int(same.nonzero()[0].item()))
-                self.repeats.add_(1)
+        self.repeats.add_(int(self.shares_part(slot)))
+        self.total.fill_(total + 1)
+
+    def shares_part(self, slot: int) -> bool:
+        """Return whether another point is of the same known part as the point in this slot."""
+        part = int(self.parts[slot].item())
+        return part != 0 and int((self.parts == part).sum().item()) > 1
 
     @torch.jit.export
     def squared_distances(self, z: Tensor, part: int = 0) -> Tensor:
@@ -283,8 +258,7 @@ class RadiusIndex(nn.Module):
         if z.size(0) > 1:
             query = query.index_select(1, self.spaces[:n])  # (d, n): in each point's own space
         distances = (self.points.narrow(1, 0, n) - query).square_().sum(0)
-        # The filter spares nearly all queries of new parts the comparison with every point.
-        if part != 0 and bool(self.part_filter[part & self.filter_mask].item()):
+        if part != 0:
             distances.masked_fill_(self.parts[:n] == part, float("inf"))
         return distances
 
@@ -324,10 +298,10 @@ class RadiusIndex(nn.Module):
         failures), each rounded to a whole number, because bounds need whole trials.
         """
         slots = inside.nonzero().flatten()
-        first = self.first.index_select(0, slots)
-        ones = torch.ones(first.size(0), dtype=torch.float64)
-        m = torch.zeros(self.capacity, dtype=torch.float64).index_add_(0, first, ones)
-        worth = 1.0 / (1.0 + (m.index_select(0, first) - 1.0) * self.agreement)
+        parts = self.parts.index_select(0, slots)
+        _, inverse, n_points = torch.unique(parts, return_inverse=True, return_counts=True)
+        m = n_points.index_select(0, inverse).masked_fill_(parts == 0, 1).to(torch.float64)
+        worth = 1.0 / (1.0 + (m - 1.0) * self.agreement)
         successes = float((worth * self.labels[1].index_select(0, slots)).sum().item())
         failures = float(worth.sum().item()) - successes
         return int(successes + 0.5), int(failures + 0.5)
@@ -372,29 +346,28 @@ class RadiusIndex(nn.Module):
         Raises
         ------
         ValueError
-            For other shapes. If `numbers` has another one, the points are partly added already.
+            For other shapes; nothing is added then.
         """
-        z = np.array(points, dtype=np.float32)  # copies, for torch needs writable arrays
-        y = np.array(labels, dtype=np.float32)
-        zeros = np.zeros(len(z), np.int64)
-        k = zeros if spaces is None else np.array(spaces, dtype=np.int64)
-        hashes = zeros if parts is None else np.array(parts, dtype=np.int64)
-        n = (len(z),)
-        if z.ndim != 2 or z.shape[1] != self.dim or {y.shape, k.shape, hashes.shape} != {n}:
-            wanted = f"points (n, {self.dim}) with n labels, n spaces and n parts"
-            actual = f"{z.shape}, {y.shape}, {k.shape} and {hashes.shape}"
-            raise ValueError(f"Expected {wanted}, got {actual}.")
-        total = int(self.total)
-        newest = slice(max(0, len(z) - self.capacity), None)
-        slots = (total + np.arange(len(z))[newest]) % self.capacity
-        self.points[:, slots] = torch.from_numpy(z[newest].T)
-        self.labels[1, slots] = torch.from_numpy(y[newest])
-        self.spaces[slots] = torch.from_numpy(k[newest])
-        self.parts[slots] = torch.from_numpy(hashes[newest])
-        self.numbers[slots] = 0 if numbers is None else np.asarray(numbers)[newest]
-        self.total.fill_(total + len(z))
-        if hashes.any() or int(self.repeats) > 0:
-            self._index_parts()
+        z = torch.tensor(np.asarray(points, dtype=np.float32))
+        blocks = (self.labels[1], self.spaces, self.parts, torch.from_numpy(self.numbers))
+        columns = [
+            torch.tensor(np.zeros(len(z)) if values is None else np.asarray(values))
+            for values in (labels, spaces, parts, numbers)
+        ]
+        is_column = all(column.shape == z.shape[:1] for column in columns)
+        if z.ndim != 2 or z.size(1) != self.dim or not is_column:
+            shapes = ", ".join(str(tuple(values.shape)) for values in (z, *columns))
+            raise ValueError(
+                f"Expected points (n, {self.dim}) with n labels, n spaces, n parts and n numbers, "
+                f"got {shapes}."
+            )
+        newest = slice(-self.capacity, None)
+        slots = (int(self.total) + torch.arange(len(z)))[newest] % self.capacity
+        self.points[:, slots] = z[newest].T
+        for block, column in zip(blocks, columns, strict=True):
+            block[slots] = column[newest].to(block.dtype)
+        self.total.add_(len(z))
+        self._count_repeats()
 
     def relabel(self, number: int, part: int, label: int | None) -> bool:
         """Change the label of the point with a number, or remove the point.
@@ -428,15 +401,12 @@ class RadiusIndex(nn.Module):
         if label is not None:
             self.labels[1, slot] = float(label)
             return True
-        order = (int(self.total) - n + torch.arange(n)) % self.capacity  # oldest first
-        order = order[order != slot]
-        numbers = torch.from_numpy(self.numbers)
-        for block in (self.points, self.labels, self.spaces, self.parts, numbers):
-            block[..., : n - 1] = block[..., order]
-            block[..., n - 1 :] = 0
-        self.labels[:, n - 1 :] = 1.0
-        self.total.fill_(n - 1)
-        self._index_parts()
+        order = (int(self.total) - n + np.arange(n)) % self.capacity  # oldest first
+        columns = [self.column(name)[order[order != slot]] for name in COLUMNS]
+        for block in (self.points, self.labels[1], self.spaces, self.parts, self.total):
+            block.zero_()
+        self.numbers[:] = 0
+        self.add(*columns)
         return True
 
     def estimate_agreement(self) -> None:
@@ -448,21 +418,11 @@ class RadiusIndex(nn.Module):
             columns = map(self.column, ("points", "labels", "spaces", "parts"))
             self.agreement.fill_(label_agreement(*columns))
 
-    def _index_parts(self) -> None:
-        """Compute `first`, `repeats` and `part_filter` anew, in place, from the points' parts.
-
-        `first` holds for each point the first position with a point of the same part, `repeats` the
-        number of points whose part is at an earlier position. `part_filter` marks the last bits of
-        the parts' hashes, so that `squared_distances` can tell quickly that a part is not there.
-        """
+    def _count_repeats(self) -> None:
+        """Set `repeats`: the number of points of known parts, less the number of these parts."""
         parts = self.column("parts")
-        slots = np.arange(self.capacity)
-        _, first, inverse = np.unique(parts, return_index=True, return_inverse=True)
-        slots[: len(self)] = np.where(parts != 0, first[inverse], slots[: len(self)])
-        self.first.copy_(torch.from_numpy(slots))
-        self.repeats.fill_(int((slots != np.arange(self.capacity)).sum()))
-        self.part_filter.zero_()
-        self.part_filter[torch.from_numpy(parts & self.filter_mask)] = True
+        known = parts[parts != 0]
+        self.repeats.fill_(len(known) - len(np.unique(known)))
 
     def get_state(self) -> dict[str, NDArray[Any]]:
         """Return copies of the arrays of the index, by name, from which `from_state` restores it.
@@ -471,9 +431,8 @@ class RadiusIndex(nn.Module):
         `numbers` (of the labels) are (n,), in the order of the points. `agreement` (how strongly
         repeated labels of a part agree) and `total` (points ever added) have no dimension.
         """
-        names = ("labels", "spaces", "parts", "numbers")
         state = {"points": self.column("points").T.copy()}
-        state |= {name: self.column(name).copy() for name in names}
+        state |= {name: self.column(name).copy() for name in COLUMNS[1:]}
         return state | {name: getattr(self, name).numpy().copy() for name in ("agreement", "total")}
 
     @classmethod
@@ -490,8 +449,7 @@ class RadiusIndex(nn.Module):
         older = int(state["total"]) - n  # points that left
         index.total.fill_(older if capacity <= n else 0)
         order = (older + np.arange(n)) % max(n, 1)  # oldest first
-        columns = (state[name][order] for name in ("labels", "spaces", "parts", "numbers"))
-        index.add(state["points"].T[order], *columns)
+        index.add(state["points"].T[order], *(state[name][order] for name in COLUMNS[1:]))
         index.agreement.fill_(float(state["agreement"]))
         return index
 

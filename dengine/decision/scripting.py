@@ -141,11 +141,8 @@ def incompatible_model_error(defect: str) -> StoreError:
 
     `defect` ends the phrase "got one whose ...", for example "encoder has other sizes".
     """
-    actual = f"one whose {defect}; its labels are whole"
-    do = (
-        "pass the reducer of the store, or learn from them anew, by "
-        "`dengine train --data OLD.db --store NEW.db`"
-    )
     return StoreError(
-        f"Expected a model of this reducer and of this version of dengine, got {actual}: {do}."
+        "Expected a model of this reducer and of this version of dengine, got one whose "
+        f"{defect}; its labels are whole: pass the reducer of the store, or learn from them anew, "
+        "by `dengine train --data OLD.db --store NEW.db`."
     )

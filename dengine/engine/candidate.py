@@ -10,7 +10,7 @@ happens either all at once or in short steps between cycles.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 
 from ..decision.scripting import reason_of
@@ -31,6 +31,8 @@ class Candidate:
         The model that decides meanwhile; the candidate takes over its rule.
     version : int
         Number of the version in force, for the report of a training that was dropped.
+    corrected_to : int
+        Number of the newest correction that the labels of the training had.
     clock : callable
         Seconds, of any origin.
 
@@ -40,54 +42,52 @@ class Candidate:
         None if the training is dropped: then only the report is stored.
     report : RetrainReport
     trained_on : TrainedOn
-        Set by `complete_report`.
+        The labels of the training.
     is_stored : bool
         Whether the version, or the report of a dropped one, is in the store.
     """
 
     def __init__(
-        self, trained: Trained, previous: EngineModel, version: int, clock: Callable[[], float]
+        self,
+        trained: Trained,
+        previous: EngineModel,
+        version: int,
+        corrected_to: int,
+        clock: Callable[[], float],
     ) -> None:
         self.model = trained.model
         self.report = RetrainReport(
             version, 0.0, len(trained.seq), trained.n_steps, False, trained.reason
         )
-        self.trained_on = TrainedOn()
+        self._learned_to = int(trained.seq[-1]) if len(trained.seq) else 0
+        self.trained_on = TrainedOn(trained.seq, corrected_to, self._learned_to)
         self.is_stored = False
         self._previous = previous
         self._clock = clock
-        self._seq = trained.seq
-        self._learned_to = int(trained.seq[-1]) if len(trained.seq) else 0
-        self._work_began = clock()
-        self._seconds = self._work_began - trained.begin  # of work on it, until `_work_began`
+        self._begin = trained.begin  # of the retrain, as if all time since were work on it
+        self._work_ended = clock()
 
     def begin_work(self) -> None:
         """Count the time from now on as work on the retrain, until `end_work`."""
-        self._work_began = self._clock()
+        self._begin += self._clock() - self._work_ended
 
     def end_work(self) -> None:
         """Count the time from now on as the cell's own, which the retrain's report leaves out."""
-        self._seconds += self._clock() - self._work_began
+        self._work_ended = self._clock()
 
-    def check(self) -> Iterator[None]:
+    def check(self) -> None:
         """Make the model ready to decide, and test it on some traces of its training.
 
-        The model takes over the rule of the previous model, which decides until now. Then the
-        generator yields before each test, which decides on one trace. If the compiled model gives
-        another result than the trained one, or raises, the training is dropped: `model` becomes
-        None, and the report says why. An exception, also one while the rule is taken over, is
-        logged and not raised. If `model` is None already, nothing is done.
+        The model takes over the rule of the previous model, which decides until now. If the
+        compiled model gives another result than the trained one, or raises, the training is
+        dropped: `model` becomes None, and the report says why. An exception, also one while the
+        rule is taken over, is logged and not raised. If `model` is None already, nothing is done.
         """
         if self.model is None:
             return
-        defect = ""
         try:
             self.model.prepare(self._previous)
-            yield
-            for defect in self.model.check_answers():
-                if defect:
-                    break
-                yield
+            defect = self.model.check_answers()
         except Exception as error:  # no exception inside a model reaches the cell
             log.exception("the model that was trained cannot answer")
             defect = reason_of(error)
@@ -105,29 +105,24 @@ class Candidate:
         """
         if self.model is None:
             return False
-        missing = window.newer(self._learned_to)
-        if not missing:
+        row = window.row_after(self._learned_to)
+        if row is None:
             return False
-        seq = missing[0]
-        trace, label, hash_ = window.row(seq)
-        guarded(NO_REFERENCE, self.model.add_reference, trace, label, hash_, seq)
-        self._learned_to = seq
+        self._learned_to, trace, label, hash_ = row
+        guarded(NO_REFERENCE, self.model.add_reference, trace, label, hash_, self._learned_to)
         return True
 
-    def complete_report(self, version: int, corrected_to: int) -> RetrainReport:
+    def complete_report(self, version: int) -> RetrainReport:
         """Put the seconds of work so far into the report, and return it for the caller to store.
 
-        If there is a model, the report is also marked as accepted and gets the number `version`,
-        and `trained_on`, which names the labels of the training, is set. `corrected_to` is the
-        number of the newest correction that the labels of the training had. Without a model the
-        report stays that of a dropped retrain, with the number of the version in force. Seconds
-        after this call are in no report.
+        If there is a model, the report is also marked as accepted and gets the number `version`.
+        Without a model it stays that of a dropped retrain, with the number of the version in force.
+        Seconds after this call are in no report.
         """
-        seconds = self._seconds + self._clock() - self._work_began  # storing it comes on top
+        seconds = self._clock() - self._begin  # storing it comes on top
         self.report = replace(self.report, seconds=seconds)
         if self.model is not None:
             self.report = replace(self.report, version=version, accepted=True)
-            self.trained_on = TrainedOn(self._seq, corrected_to, int(self._seq[-1]))
         return self.report
 
     def end_storing(self, version: int) -> None:

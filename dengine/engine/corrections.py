@@ -12,13 +12,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-import numpy as np
-
 from ..decision.intervals import SORTING_GUARANTEES
 from ..decision.members import SAFE_MODES
 from ..decision.policy import Policy
-from ..errors import ReportError, SettingError, expect, listed
-from ..records import as_success
+from ..errors import ReportError, expect, listed
+from ..records import as_success, is_whole
 from ..store.outbox import Outbox
 from ..store.records import (
     POLICY_CHANGED,
@@ -31,7 +29,7 @@ from ..traces import check_rate
 from .feedback import Feedback
 from .learner import Learner
 from .live_model import LiveModel
-from .settings import BASELINE_SETTINGS, EvidenceWindow, Settings, SettingsInForce
+from .settings import BASELINE_SETTINGS, EvidenceWindow, SettingsInForce, refuse_idle
 
 # Settings of a policy that make its rule, or that its evidence is measured by.
 SCORING = ("alpha", "lower_bound", "interval", "guarantee", "stops", "prices")
@@ -275,11 +273,8 @@ class Corrections:
         Exception
             What a model raises that must be fitted again.
         """
-        if isinstance(version, bool) or not isinstance(version, int | np.integer):
-            raise SettingError(
-                f"Expected the number of a version, got {version!r}; "
-                "`store.versions.retrains()` lists them."
-            )
+        do = "`store.versions.retrains()` lists them"
+        expect(is_whole(version, -(2**63), 2**63 - 1), "the number of a version", version, do)
         self._bring_up_to_date()
         before = self._live.version
         pinned = self._live.pinned
@@ -355,7 +350,7 @@ class Corrections:
             return self._as_unchanged("policy", "The policy is in force already")
         is_baseline = present.model is not None  # it keeps its rule
         if is_baseline:
-            _check_baseline_settings(changes)
+            refuse_idle(sorted(changes.keys() - BASELINE_SETTINGS))
         self._bring_up_to_date()
         # An audit counts by its inclusion probability, so the pooled evidence must be of one audit
         # rate.
@@ -448,20 +443,6 @@ class Corrections:
     def _as_unchanged(self, kind: str, text: str) -> Changed:
         """Return a `Changed` for a request that was fulfilled already; no event is recorded."""
         return Changed(kind, _sentence(f"{text}; nothing changed."), None, self._live.version)
-
-
-def _check_baseline_settings(changes: Settings) -> None:
-    """Raise SettingError for changes of a policy that have no effect on a handed-in model.
-
-    `changes` holds the changed settings by name. Only audit_rate, stops, label_within, force_limits
-    and shadow (`BASELINE_SETTINGS`) have an effect.
-    """
-    idle = sorted(set(changes) - set(BASELINE_SETTINGS))
-    if idle:
-        raise SettingError(
-            f"A model that was handed in decides by its own numbers, so {', '.join(idle)} would "
-            "have no effect; change only audit_rate, stops, label_within, force_limits and shadow."
-        )
 
 
 def _sentence(text: str) -> str:

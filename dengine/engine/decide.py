@@ -31,6 +31,7 @@ from ..records import (
     TraceSpec,
     as_id,
     is_name,
+    is_whole,
 )
 from ..store.outbox import Outbox
 from ..store.records import StoredDecision
@@ -359,8 +360,8 @@ def as_part(part: Any) -> str | None:
     """
     if part is None:
         return None
-    is_whole = isinstance(part, int | np.integer) and not isinstance(part, bool)
-    text = str(part) if is_whole and abs(int(part)) < 10**LONGEST else part
+    largest = 10**LONGEST - 1
+    text = str(part) if is_whole(part, -largest, largest) else part
     expect(
         is_name(text),
         f"a part's number, a whole number or a text of 1 to {LONGEST} characters that print",

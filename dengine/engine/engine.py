@@ -14,12 +14,11 @@ call the same methods.
 from __future__ import annotations
 
 import os
-import threading
 import time
 import weakref
 from collections.abc import Callable, Collection, Iterator
 from concurrent.futures import Executor
-from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Self, TypedDict, Unpack, overload
 
@@ -60,7 +59,6 @@ from .exclusive import ExclusiveUse
 from .feedback import Feedback, Remedy
 from .fleet import Peers
 from .garbage import frozen_objects, uncollected
-from .labels import CellLabels
 from .learner import Learner
 from .live_model import LiveModel
 from .settings import (
@@ -75,7 +73,7 @@ from .settings import (
     read_peers_trace_spec,
 )
 from .state import EngineState
-from .trainer import Clock, Limits, Retrainer, TrainingWindow
+from .trainer import Clock, Retrainer, TrainingWindow
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -131,8 +129,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         A recipe, its name or a TOML file, for all settings that are not given as arguments. The
         reducer is part of the recipe: another `reducer` beside it is refused.
     model : Model, optional
-        A baseline, which decides by its own rule: of a policy only audit_rate, stops, label_within,
-        force_limits and shadow count then.
+        A baseline, no `ModelPrediction`; it decides by its own rule: of a policy only audit_rate,
+        stops, label_within, force_limits and shadow count then.
     executor : concurrent.futures.Executor, optional
         Where retrains run while the cell goes on. None: in the calling thread, between cycles;
         making the first engine of a process then takes about a second longer, since it loads what a
@@ -219,11 +217,10 @@ class DataEngine(AbstractContextManager["DataEngine"]):
 
         `template` is the untrained model, and the arguments from `executor` to `on_safe_mode` are
         those of `DataEngine`. From now on the store is closed when the engine is garbage-collected.
-        The modules that a retrain imports are loaded: with an executor in a thread that goes on
-        after this returns; without one before this returns, but not for an engine that only reads
-        (`reading`). Limits this thread to one torch thread. Raises SettingError for force limits in
-        seconds at an unknown rate, and StoreError if another engine owns the cell or the store
-        cannot be used.
+        Without an executor, and unless the engine only reads (`reading`), the modules that a
+        retrain imports are loaded. Limits this thread to one torch thread. Raises SettingError for
+        force limits in seconds at an unknown rate, and StoreError if another engine owns the cell
+        or the store cannot be used.
         """
         recipe = settings.recipe
         check_rate(recipe.policy.force_limits, settings.trace)
@@ -240,24 +237,20 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         self._settings = SettingsInForce(settings, self._outbox)
         window = TrainingWindow(recipe.window)
         self._live = LiveModel(template, window, self._outbox, settings.evidence)
-        labels = CellLabels(window, self._live)
         peers = None
         if store.product is not None:
             peers = Peers(self._outbox, self._live, window, clock)
-        self._feedback = Feedback(self._outbox, self._live, labels, self._settings, on_safe_mode)
-        limits = Limits(None if replaying else recipe.budget, recipe.max_steps)
-        retrainer = Retrainer(window, limits, executor, clock)
+        self._feedback = Feedback(self._outbox, self._live, window, self._settings, on_safe_mode)
+        budget = None if replaying else recipe.budget
+        retrainer = Retrainer(window, budget, recipe.max_steps, executor, clock)
         self._learner = Learner(
-            self._outbox, self._live, window, labels, self._feedback, peers, retrainer, clock
+            self._outbox, self._live, window, self._feedback, peers, retrainer, clock
         )
         self._maker = DecisionMaker(self._settings, self._live, self._outbox)
         self._corrections = Corrections(
             self._outbox, self._settings, self._live, self._learner, self._feedback
         )
         self.state = EngineState(self._live, self._learner, self._outbox)
-        self._warm_up = threading.Thread(target=template.warm_up, name="dengine-warm-up")
-        if executor is not None:
-            self._warm_up.start()
         weakref.finalize(self, _close_forgotten, self._outbox)
 
     def _resume(self) -> None:
@@ -284,15 +277,10 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         if the model can be compiled; in other cases `Learner.resume` began to. There is no time
         limit; if the computation fails, that is logged, and nothing is raised.
         """
-        self._join_warm_up()
+        self._live.template.warm_up()
         if self.state.new_labels and not self.version:
             self._learner.precompute()
         self._learner.wait_until_precomputed()
-
-    def _join_warm_up(self) -> None:
-        """Wait until what a retrain imports is loaded."""
-        if self._warm_up.ident is not None:
-            self._warm_up.join()
 
     @contextmanager
     def _closed_on_failure(self) -> Iterator[None]:
@@ -438,7 +426,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
                 return cls(
                     store=opened, **fill_from_peers(settings | {"seed": seed}, opened, allowed)
                 )
-            names = ("model", "trace", "executor", "replaying", "clock", "on_safe_mode")
+            names = ("model", "trace", *RunOptions.__annotations__)
             options = {name: settings.pop(name) for name in names if name in settings}
             recipe = settings.get("recipe")
             reducer = settings.get("reducer")
@@ -681,11 +669,12 @@ class DataEngine(AbstractContextManager["DataEngine"]):
             self._outbox.check_usable()
             with self._exclusive:
                 self._maker.set_trace_spec(spec)
-        with ExitStack() as ending:
-            ending.callback(self.flush, LONG_WAIT)
-            ending.enter_context(frozen_objects())
-            for index in range(cycles):
-                yield self._cycle(cell, index)
+        try:
+            with frozen_objects():
+                for index in range(cycles):
+                    yield self._cycle(cell, index)
+        finally:
+            self.flush(LONG_WAIT)
 
     def _cycle(self, cell: Cell, index: int) -> Cycle:
         """Have the cell insert one part, decide, do what the decision says, and report the outcome.
@@ -748,8 +737,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         ----------
         wait : bool, default True
             True: a version that is already trained is first put in force or dropped, and a training
-            that is not done is discarded. In the first two seconds of an engine the call also waits
-            for the modules that a retrain imports. False: begin to retrain in the executor, and
+            that is not done is discarded. With an executor the first such call also loads the
+            modules that a retrain imports. False: begin to retrain in the executor, and
             return None. If a retrain is under way, nothing is begun; if the executor cannot begin
             yet, `poll` or `report` begins it. `poll` brings it to its end. Without an executor it
             runs in this thread, and its report is returned.
@@ -764,7 +753,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         self._outbox.check_usable()
         with self._exclusive:
             if wait:
-                self._join_warm_up()  # its time is no part of the retrain's
+                self._live.template.warm_up()  # its time is no part of the retrain's
                 self._learner.end_training()  # what it would give lacks the newest labels
             else:
                 self._learner.advance()

@@ -13,7 +13,7 @@ from collections.abc import Callable
 from enum import Enum
 
 from ..errors import log
-from ..records import Action, Reason, Source, source_of
+from ..records import Action, Source, source_of
 from ..store.outbox import Outbox
 from ..store.records import (
     LATE_STOP,
@@ -23,16 +23,9 @@ from ..store.records import (
     StoredDecision,
     already_reported,
 )
-from .labels import CellLabels
 from .live_model import LiveModel
 from .settings import SettingsInForce
-
-RECENT = 50  # decisions that the share of novel ones fades over
-NEARLY_ALL = 0.8  # of them, and somebody should look
-ALL_NOVEL = (
-    "nearly every trace is novel: the sensor or the parts have changed, "
-    "or parts come twice without numbers (part=)"
-)
+from .trainer import TrainingWindow
 
 
 class Remedy(Enum):
@@ -51,8 +44,9 @@ class Feedback:
         Takes the labels.
     live : LiveModel
         Learns from them.
-    labels : CellLabels
-        Takes each label that is recorded.
+    window : TrainingWindow
+        Takes each label that is recorded; in a product, whose cells share labels, `fleet.Peers`
+        reads them from the store instead.
     settings : SettingsInForce
         Whether an accepted part without a report is confirmed by the next decision, and since which
         version.
@@ -62,6 +56,10 @@ class Feedback:
 
     Attributes
     ----------
+    new_labels : int
+        Labels since the last retrain began; each counts as soon as it is learned. In a product
+        these are the cell's own, and those of peers that came after the version in force was
+        trained, and before this cell put it in force or opened the store.
     remedy : Remedy or None
         What must be done after a wrong label was learned, as soon as the store has every label;
         `learner.Learner` does it.
@@ -71,16 +69,20 @@ class Feedback:
         self,
         outbox: Outbox,
         live: LiveModel,
-        labels: CellLabels,
+        window: TrainingWindow,
         settings: SettingsInForce,
         on_safe_mode: Callable[[str], object] | None = None,
     ) -> None:
         self._outbox = outbox
         self._live = live
-        self._labels = labels
+        self._window = window
         self._settings = settings
         self._on_safe_mode = on_safe_mode
+        self.new_labels = 0
         self.remedy: Remedy | None = None
+        # In a product: labels that the store has not numbered, by decision, with the provisional
+        # numbers of their references.
+        self._provisional: dict[str, int] = {}
         # Accepted parts without an outcome yet.
         self._unreported: OrderedDict[str, StoredDecision] = OrderedDict()
         # Reports that were learned and are not known to be on disk.
@@ -90,8 +92,6 @@ class Feedback:
         # Accepted parts that went on without an outcome since the last label.
         self._n_unreported = 0
         self._safe_mode = ""
-        self._novel_share = 0.0  # of the recent decisions
-        self._novelty_reported = False
 
     @property
     def _stops_all(self) -> bool:
@@ -127,9 +127,7 @@ class Feedback:
         """Note a new decision: VERIFY as a pending check, ACCEPT as a part without an outcome.
 
         A VERIFY of a trace with a fault is not pending. The rule counts each check that has become
-        overdue as a wrong decision (`_count_overdue`). When more than 80 % of the decisions have
-        `Reason.NOVEL`, in a mean that fades over 50 decisions and begins at 0, an event is
-        recorded, and the next such event only after this share has fallen to one half or less.
+        overdue as a wrong decision (`_count_overdue`).
         """
         decision = stored.decision
         if decision.action is Action.VERIFY and not stored.quarantined:
@@ -137,13 +135,6 @@ class Feedback:
         self._count_overdue()
         if decision.action is Action.ACCEPT:
             self._unreported[decision.id] = stored
-        is_novel = decision.reason is Reason.NOVEL
-        self._novel_share += (is_novel - self._novel_share) / RECENT
-        if self._novel_share > NEARLY_ALL and not self._novelty_reported:
-            self._outbox.record_event("novelty", ALL_NOVEL)
-        # Reported again only after the share has fallen to one half.
-        limit = 0.5 if self._novelty_reported else NEARLY_ALL
-        self._novelty_reported = self._novel_share > limit
 
     def confirm_unreported(self) -> None:
         """Confirm or count the accepted parts without an outcome, because the next trace has come.
@@ -226,7 +217,6 @@ class Feedback:
         later.
         """
         decision = stored.decision
-        version = self._live.version
         number = self._outbox.number_label()
         point = None
         n_unreported = None  # the rule is not updated
@@ -235,20 +225,24 @@ class Feedback:
                 n_unreported = self._n_unreported - self._was_unreported(stored)
                 self._n_unreported = 0
             point = self._live.learn(stored, success, number, n_unreported)
-        overdue_to = self._live.overdue_to
         label = NewLabel(
             decision.id,
             success,
             source,
-            version,
+            self._live.version,
             point,
             n_unreported or 0,
-            overdue_to=overdue_to,
+            overdue_to=self._live.overdue_to,
             seq=number,
         )
         self._outbox.record_labels([(stored, label)])
-        if not stored.quarantined:
-            self._labels.add(stored, label)
+        if stored.quarantined:
+            return
+        self.new_labels += 1
+        if number > 0:
+            self._window.add(stored.trace, int(success), stored.content_hash, number)
+        else:
+            self._provisional[decision.id] = number
 
     def _was_unreported(self, stored: StoredDecision) -> bool:
         """Return whether this part is one of those counted as unreported.
@@ -271,9 +265,22 @@ class Feedback:
         far. Nothing is raised.
         """
         self._count_overdue()
-        if self._labels.has_provisional:
-            for id_, number in self._outbox.pop_label_numbers():
-                self._labels.assign_number(id_, number)
+        if not self._provisional:
+            return
+        for id_, number in self._outbox.pop_label_numbers():
+            provisional = self._provisional.pop(id_, None)  # None: of a trace with a fault
+            if provisional is not None and self._live.answering is not None:
+                self._live.answering.renumber_reference(provisional, number)
+
+    def count_new_labels(self, after: int) -> None:
+        """Count the labels of the training window with a number above this one as new."""
+        self.new_labels = self._window.count_newer(after)
+
+    def give_labels_back(self, n_labels: int) -> None:
+        """Count the labels of a retrain that was dropped as new again, so that the next one comes
+        soon.
+        """
+        self.new_labels += n_labels
 
     def _count_overdue(self) -> None:
         """Update the rule with each decision whose check has become overdue, as with a wrong one.
@@ -291,8 +298,7 @@ class Feedback:
         while pending and next(iter(pending.values())).number <= overdue_to:
             _, stored = pending.popitem(last=False)
             self._live.count_overdue(stored.decision)
-        if overdue_to > self._live.overdue_to:
-            self._live.mark_examined_to(overdue_to)
+        self._live.mark_examined_to(overdue_to)
 
     def take_remedy(self) -> Remedy | None:
         """Return, once, what must be put right after a wrong label; None if nothing must be."""

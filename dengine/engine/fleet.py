@@ -14,10 +14,10 @@ import numpy as np
 
 from ..errors import StoreError, log
 from ..store.outbox import Outbox
-from ..store.records import VersionError, without_rule
+from ..store.records import VersionError
 from .guard import NOT_READY, guarded
 from .live_model import LiveModel
-from .resume import add_labels_since, restore_model
+from .resume import ChangedTracesError, add_labels_since, restore_model
 from .trainer import Clock, TrainedOn, TrainingWindow
 
 LOOK_SECONDS = 1.0  # between two looks for a newer version
@@ -116,16 +116,16 @@ class Peers:
         store = self._outbox.store
         try:
             version = self._outbox.call_store(lambda: store.versions.load(number))
-            model = restore_model(self._outbox, self._live.template, without_rule(version.state))
-            if model is None:
-                raise VersionError("a trace that it was fitted on has changed; see dengine verify.")
+            trained_on = TrainedOn.from_state(version.state)
+            model = restore_model(self._outbox, self._live.template, version, trained_on)
             add_labels_since(model, store, version, self._window.capacity)
         except Exception as error:  # no exception inside a model reaches the cell
-            if isinstance(error, StoreError) and not isinstance(error, VersionError):
+            is_of_version = isinstance(error, VersionError | ChangedTracesError)
+            if isinstance(error, StoreError) and not is_of_version:
                 raise
             log.exception("version %d of product %s cannot be used", number, store.product)
             self._refused = number
             return False
         guarded(NOT_READY, model.prepare, self._live.newest)
-        self._live.swap_in(model, number, TrainedOn.from_state(version.state))
+        self._live.swap_in(model, number, trained_on)
         return True

@@ -23,14 +23,13 @@ from ..errors import StoreError, log
 from ..model.base import EngineModel
 from ..records import RetrainReport
 from ..store.outbox import Outbox
-from ..store.records import Change, ModelVersion, without_rule
+from ..store.records import Change
 from .candidate import Candidate
 from .feedback import Feedback, Remedy
 from .fleet import Peers
 from .guard import NOT_PRECOMPUTED, NOT_READY, guarded
-from .labels import CellLabels
 from .live_model import LiveModel
-from .resume import add_labels_since, find_clean_start, refit
+from .resume import add_labels_since, find_clean_start, restore_model
 from .settings import EvidenceWindow
 from .trainer import Clock, Retrainer, Trained, TrainedOn, TrainingWindow
 
@@ -47,7 +46,6 @@ class Learner:
     outbox : Outbox
     live : LiveModel
     window : TrainingWindow
-    labels : CellLabels
     feedback : Feedback
     peers : Peers or None
         None if the cell shares no product.
@@ -66,19 +64,17 @@ class Learner:
         outbox: Outbox,
         live: LiveModel,
         window: TrainingWindow,
-        labels: CellLabels,
         feedback: Feedback,
         peers: Peers | None,
         retrainer: Retrainer,
         clock: Clock,
     ) -> None:
         self.live = live
-        self.labels = labels
+        self.feedback = feedback
         self.dropped: list[str] = []
         self._outbox = outbox
         self._store = outbox.store  # called without a time limit, so never while the cell waits
         self._window = window
-        self._feedback = feedback
         self._peers = peers
         self._retrainer = retrainer
         self._clock = clock
@@ -99,7 +95,8 @@ class Learner:
         after which a check without a report is overdue, and `policy_since` the first version under
         the policy in force. If there is a version, or at least IMPORTED labels (500), this also
         starts a thread that computes in advance for the next retrain (`precompute`). Raises
-        StoreError if the store cannot be read, and the other errors of `LiveModel.resume`.
+        StoreError if the store cannot be read, and the
+        other errors of `LiveModel.resume`.
         """
         version = self._store.versions.newest()
         reports = self._store.versions.retrains()
@@ -117,7 +114,7 @@ class Learner:
         """
         capacity = self._window.capacity
         self._window.refill(self._store.labels.with_traces(capacity, corrected_to=corrected_to))
-        self.labels.count_from(self.live.trained_on.counts_from)
+        self.feedback.count_new_labels(self.live.trained_on.counts_from)
 
     def precompute(self) -> None:
         """Start a thread that computes in advance what the next training needs; do not wait for it.
@@ -151,10 +148,10 @@ class Learner:
         retrained here, or, if it is pinned, fitted again, and what that raises is raised. If the
         store fails meanwhile, that is logged and not raised, and a later call tries again.
         """
-        self._feedback.number_labels()
-        if self._feedback.remedy is None or not self._outbox.is_drained or self._outbox.fault:
+        self.feedback.number_labels()
+        if self.feedback.remedy is None or not self._outbox.is_drained or self._outbox.fault:
             return
-        remedy = self._feedback.take_remedy()
+        remedy = self.feedback.take_remedy()
         if remedy is None:
             return
         try:
@@ -164,7 +161,7 @@ class Learner:
             else:
                 self.live.rebuild_rule()
         except StoreError:
-            self._feedback.retry_remedy(remedy)
+            self.feedback.retry_remedy(remedy)
             log.exception("the rule is rebuilt when the store is back")
 
     def store_labels(self) -> None:
@@ -191,9 +188,8 @@ class Learner:
         With `wait` True, or if no executor takes work, all is done in this thread, which then has
         one torch thread, and the report is returned. Otherwise None is returned, and `advance` puts
         the version in force later. With `wait` False, None is also returned if a training is under
-        way already, and then nothing is begun. If the executor still works on a discarded training,
-        or the computing in advance is not done, the training is requested, and `retrain_if_due`
-        begins it later.
+        way already, and then nothing is begun. If there is an executor, and the computing in
+        advance is not done, the training is requested, and `retrain_if_due` begins it later.
 
         A version that fails or cannot be stored is dropped, and the report says so. If the version
         is stored, but labels that came since cannot be, it is put in force by a later call; its
@@ -205,15 +201,14 @@ class Learner:
             if self.is_at_work:
                 return None
             is_preparing = self._precomputed is not None and not self._precomputed.done()
-            has_executor = self._retrainer.executor is not None
-            if has_executor and (is_preparing or self._retrainer.is_occupied):
+            if self._retrainer.executor is not None and is_preparing:
                 self._is_requested = True
                 return None
         self.store_labels()
         begin = self._clock()
         self.wait_until_precomputed()
         self._hear_of_peers()
-        self.labels.begin_retrain()
+        self.feedback.count_new_labels(self._window.newest_seq)
         self._is_requested = False
         start = self._choose_start()
         if not wait and self._retrainer.start(start):
@@ -254,16 +249,15 @@ class Learner:
             preparation is under way, or if the executor now trains.
         """
         peers = self._peers
-        may_train = self.labels.is_due(retrain_every) and not self.live.pinned
+        may_train = self.feedback.new_labels >= retrain_every and not self.live.pinned
         if peers is not None and (may_train or peers.is_look_due):
             self._try_to_hear(peers, with_labels=False)
         if self.live.pinned:
             self._is_requested = False
             return None
-        is_due = self.labels.is_due(retrain_every)
-        if is_due:
-            n_labels = max(self.labels.new_labels, len(self._window))
-            is_due = n_labels >= self.live.newest.min_traces
+        n_new = self.feedback.new_labels
+        n_labels = max(n_new, len(self._window))
+        is_due = n_new >= retrain_every and n_labels >= self.live.newest.min_traces
         # A training may have ended by its budget, as after a large import; then another begins
         # without new labels. Peers would each train the same version, so they wait for labels.
         is_alone = self._peers is None and self._was_accepted
@@ -350,7 +344,10 @@ class Learner:
         note = self._start[2] if self._start is not None else ""
         if note:
             trained = replace(trained, reason=f"{trained.reason}; {note}")
-        self._candidate = Candidate(trained, self.live.newest, self.live.version, self._clock)
+        live = self.live
+        self._candidate = Candidate(
+            trained, live.newest, live.version, live.corrected_to, self._clock
+        )
         self._steps = self._see_through(self._candidate)
         return self._candidate
 
@@ -428,7 +425,8 @@ class Learner:
         waits for it. Raises StoreError if the version cannot be stored. The functions that it
         yields raise StoreError if the labels cannot.
         """
-        yield from candidate.check()
+        candidate.check()
+        yield None
         yield from self._catch_up_candidate(candidate)
         storing = self._begin_storing(candidate)
         deadline = time.monotonic() + self._outbox.limit  # to begin; a commit that runs may go on
@@ -448,7 +446,7 @@ class Learner:
         itself; a StoreError there is ignored.
         """
         for n_waits in count(1):
-            self._feedback.number_labels()
+            self.feedback.number_labels()
             while candidate.learn_next(self._window):
                 yield None
             if not self._outbox.request_label_drain():
@@ -467,7 +465,7 @@ class Learner:
         version first. Without a model only the report is stored, and the number is the report's.
         Raises StoreError if the store is unavailable. With a store in memory it is kept there.
         """
-        report = candidate.complete_report(self.live.next_version, self.live.corrected_to)
+        report = candidate.complete_report(self.live.next_version)
         newest_seq = self._window.newest_seq
         state = None
         if candidate.model is not None:
@@ -502,7 +500,7 @@ class Learner:
         log.warning("a retrain was dropped, for it could not be stored: %s", error)
         self._candidate = None
         self._was_accepted = False
-        self.labels.give_back(candidate.report.n_traces)
+        self.feedback.give_labels_back(candidate.report.n_traces)
         self._report = replace(
             candidate.report,
             version=self.live.version,
@@ -565,7 +563,7 @@ class Learner:
             self.apply_corrections(may_retrain=False)
         peers.read_labels()
         if is_newer:
-            self.labels.count_from(self.live.trained_on.counts_from)
+            self.feedback.count_new_labels(self.live.trained_on.counts_from)
 
     # What people put right
 
@@ -651,47 +649,30 @@ class Learner:
         in the store. Once it is in force, new labels count from zero, since the version knows all
         labels until now. A retrain that was requested before is not begun any more.
 
+        A baseline, which is fitted again, gets the labels as they count now, since it cannot take
+        a label back. An exception as the model takes over the rule in force is logged.
+
         Raises StoreError if the version is not kept, if a trace is damaged that the model must be
         fitted on again, and if the version cannot be stored, also because another cell of the
-        product stored one meanwhile; and what `_restore_with_rule_in_force` raises.
+        product stored one meanwhile; and what `restore_model` raises.
         """
         begin = self._clock()
         self._outbox.check_integrity()
         version = self._store.versions.load(number)
-        model, trained_on = self._restore_with_rule_in_force(version)
+        template = self.live.template
+        trained_on = TrainedOn.from_state(version.state)
+        if not template.keeps_references:
+            trained_on = replace(trained_on, corrected_to=self.live.corrected_to)
+        model = restore_model(self._outbox, template, version, trained_on)
+        guarded(NOT_READY, model.prepare, self.live.newest)
         newest = self._window.newest_seq
         add_labels_since(model, self._store, version, self._window.capacity, shared_to=newest)
         trained_on = replace(trained_on, counts_from=newest, pinned=number)
         reason = f"rolled back to version {number}"
         self._store_and_swap_in(event, model, trained_on, reason, self._clock() - begin)
         self._is_requested = False  # what was asked for was to replace another version
-        self.labels.begin_retrain()
+        self.feedback.count_new_labels(newest)
         self._precompute_other_start()
-
-    def _restore_with_rule_in_force(self, version: ModelVersion) -> tuple[EngineModel, TrainedOn]:
-        """Return the model of a stored version with the rule in force, and what it was trained on.
-
-        A model like umap-learn, of which not the fit but only the numbers of its traces are stored,
-        is fitted on these traces again, with the labels that they had then. A baseline is fitted on
-        its traces with the labels as they count now, since it cannot take a label back. The model
-        is not put in force. An exception as it takes over the rule is logged. Raises StoreError if
-        one of these traces has changed, or if this dengine cannot restore the version (then also
-        the other errors of `restore_model`), and what the fit raises.
-        """
-        state = without_rule(version.state)
-        trained_on = TrainedOn.from_state(version.state)
-        model = self.live.template.successor()
-        if not model.keeps_references:
-            trained_on = replace(trained_on, corrected_to=self.live.corrected_to)
-        if model.needs_refit(state) and not refit(model, self._outbox, trained_on):
-            raise StoreError(
-                f"Expected the traces that version {version.version} was fitted on as they were "
-                "stored, some have changed; see `dengine verify`, and restore the store from a "
-                "copy."
-            )
-        model.set_state(state)
-        guarded(NOT_READY, model.prepare, self.live.newest)
-        return model, trained_on
 
     def set_policy(self, policy: Policy | None, evidence: EvidenceWindow, event: Change) -> None:
         """Go on under another policy, as a new version of the same model.

@@ -5,7 +5,8 @@ when.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from contextlib import suppress
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,11 +21,10 @@ from ..store.records import (
     OutcomeRecord,
     StoredDecision,
     overdue_outcomes,
-    without_rule,
 )
 from ..store.rule_progress import read_rule_progress
 from .guard import NO_REFERENCE, NOT_READY, RULE_MISSED, guarded
-from .resume import add_labels_since, apply_correction, restore_model
+from .resume import ChangedTracesError, add_labels_since, apply_correction, restore_model
 from .settings import EvidenceWindow
 from .trainer import TrainedOn, TrainingWindow
 
@@ -144,27 +144,32 @@ class LiveModel:
         self.newest_version = newest_version
         model = None
         if version is not None:
+            trained_on = TrainedOn.from_state(version.state)
             # A later version may be damaged: what an earlier one's rule learned under another
             # policy is left out.
-            state = version.state if version.version >= since else without_rule(version.state)
-            model = restore_model(self.outbox, self.template, state)
+            with_rule = version.version >= since
+            with suppress(ChangedTracesError):
+                model = restore_model(
+                    self.outbox, self.template, version, trained_on, with_rule=with_rule
+                )
         past = read_rule_progress(
             store, None if model is None else version, since, label_within, policy_since
         )
         self.overdue = set(past.overdue_ids)
         self.overdue_to = past.overdue_to
         if version is None or model is None:
-            self._rebuild_rule_of(self.template, self._read_outcomes)
+            self._start_rule(self._read_outcomes(0))
             numbers = (correction.number for correction in store.corrections.after())
             self.corrected_to = max(numbers, default=0)
             return
-        self.swap_in(model, version.version, TrainedOn.from_state(version.state))
+        self.swap_in(model, version.version, trained_on)
         guarded(NOT_READY, model.prepare, self.template)
         self.corrected_to = add_labels_since(model, store, version, self.window.capacity)
+        outcomes = self._read_outcomes(past.last_seq)
         if past.last_seq:
-            _update_rule(model, lambda: self._read_outcomes(past.last_seq))
+            self._update_rule(outcomes)
         else:
-            self._rebuild_rule_of(model, self._read_outcomes)
+            self._start_rule(outcomes)
 
     def swap_in(self, model: EngineModel, version: int, trained_on: TrainedOn) -> None:
         """Put a model in force, as the version of this number; nothing is stored.
@@ -233,9 +238,10 @@ class LiveModel:
         """
         if decision.model_version < self.evidence.since:  # of an earlier policy, as in `learn`
             return
-        for outcome in overdue_outcomes(decision):
+        outcomes = overdue_outcomes(decision)
+        if outcomes:
             self.overdue.add(decision.id)
-            guarded(RULE_MISSED, self.newest.update_rule, *outcome[1:])
+        self._update_rule(outcomes)
 
     def mark_examined_to(self, number: int) -> None:
         """Note that decisions up to this number, a larger one, were examined for overdue checks."""
@@ -247,10 +253,9 @@ class LiveModel:
         The decision leaves the set `overdue`. Returns whether it was in it. If True, the caller
         must have the rule rebuilt, because the rule has counted the decision as wrong.
         """
-        if decision_id not in self.overdue:
-            return False
+        was_overdue = decision_id in self.overdue
         self.overdue.discard(decision_id)
-        return True
+        return was_overdue
 
     def rebuild_rule(self) -> None:
         """Reset the rule, and update it with the stored outcomes of decisions since it began.
@@ -272,27 +277,37 @@ class LiveModel:
         outcomes = self.outbox.call_store(
             lambda: store.labels.outcomes_since(0, self.evidence.since, self.overdue_to)
         )
-        self._rebuild_rule_of(self.newest, lambda: outcomes)
+        self._start_rule(outcomes)
 
-    def _rebuild_rule_of(
-        self, model: EngineModel, read_outcomes: Callable[[], list[OutcomeRecord]]
-    ) -> None:
-        """Reset a model's rule and update it with the outcomes that `read_outcomes` returns.
+    def _start_rule(self, outcomes: Sequence[OutcomeRecord]) -> None:
+        """Reset the rule, and update it with these outcomes (`_update_rule`).
 
-        It starts in the safe mode that `evidence` names (`began_in`). A failed update is logged,
-        and the rule is stale then. A rule that never learns is only reset, and `read_outcomes` is
-        not called. What this raises is raised after the reset.
+        It starts in the safe mode that `evidence` names (`began_in`).
         """
-        model.reset_rule(self.evidence.began_in)
-        _update_rule(model, read_outcomes)
+        self.newest.reset_rule(self.evidence.began_in)
+        self._update_rule(outcomes)
 
-    def _read_outcomes(self, after: int = 0) -> list[OutcomeRecord]:
+    def _update_rule(self, outcomes: Sequence[OutcomeRecord]) -> None:
+        """Update the rule, if it can learn, with outcomes in the order of their labels.
+
+        It is the rule of the model in force, or of the untrained model. An update that fails is
+        logged, and the rule is stale then: every part is verified; the updates after it are made
+        all the same.
+        """
+        if self.newest.rule_learns:
+            for outcome in outcomes:
+                guarded(RULE_MISSED, self.newest.update_rule, *outcome[1:])
+
+    def _read_outcomes(self, after: int) -> list[OutcomeRecord]:
         """Return the stored outcomes of labels after this number, checked against the ledger.
 
         The ledger is the store's hash chain. A failed check sets the outbox's `integrity_error`,
         after which every part is verified; the outcomes are returned all the same. Overdue checks
-        are among them. Raises StoreError if the store cannot be read.
+        are among them. For a rule that never learns nothing is read or checked, and the list is
+        empty. Raises StoreError if the store cannot be read.
         """
+        if not self.newest.rule_learns:
+            return []
         self.outbox.check_integrity(after)
         return self.outbox.store.labels.outcomes_since(after, self.evidence.since, self.overdue_to)
 
@@ -359,16 +374,3 @@ class LiveModel:
                 True
             )  # an engine that opens the store rebuilds the rule
         return state
-
-
-def _update_rule(model: EngineModel, read_outcomes: Callable[[], list[OutcomeRecord]]) -> None:
-    """Update a model's rule with outcomes in the order of their labels.
-
-    `read_outcomes` returns the outcomes; what it raises is raised. An update that fails is logged,
-    and the rule is stale then: every part is verified; the updates after it are made all the same.
-    For a rule that never learns, `read_outcomes` is not called.
-    """
-    if not model.rule_learns:
-        return
-    for outcome in read_outcomes():
-        guarded(RULE_MISSED, model.update_rule, *outcome[1:])

@@ -6,12 +6,10 @@ and after labels were forgotten, and `fleet.Peers` when another cell's version i
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Mapping
 from contextlib import suppress
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import StoreError
 from ..model.base import EngineModel
@@ -24,47 +22,42 @@ if TYPE_CHECKING:
     from ..store.sql import SqlStore
 
 
+class ChangedTracesError(StoreError):
+    """A version must be fitted again, on traces of which some are missing or damaged."""
+
+
 def restore_model(
-    outbox: Outbox, template: EngineModel, state: Mapping[str, NDArray[Any]]
-) -> EngineModel | None:
+    outbox: Outbox,
+    template: EngineModel,
+    version: ModelVersion,
+    trained_on: TrainedOn,
+    *,
+    with_rule: bool = False,
+) -> EngineModel:
     """Return a new model, made from the untrained model `template`, as a stored version was.
 
-    `state` holds the arrays of the version by name. A model like umap-learn, of which not the fit
-    but only the numbers of its traces are stored, is trained on these traces again (`refit`), after
-    their labels are compared with the ledger: a difference sets the outbox's `integrity_error`.
-    Returns None if one of these traces is missing, or damaged, of which an event tells. The new
-    model and the template share one rule, so the template gets the stored rule, too, if `state`
-    holds one. Raises StoreError (KeyError, ValueError or NotImplementedError, if it is of another
-    reducer) for a state that this dengine cannot restore, StoreError for a label that is neither 0
-    nor 1, for traces of different shapes, and if the store cannot be read, and what the training
-    raises.
+    A model like umap-learn, of which not the fit but only the numbers of its traces are stored, is
+    trained again: on the traces of `trained_on`, with the labels as they were after the correction
+    that it names. The labels are first compared with the ledger, the store's hash chain. A
+    difference sets the outbox's `integrity_error`, after which every part is verified, and the
+    model is trained nevertheless. A trace whose label was forgotten by then is left out, and does
+    not count as missing. The new model and the template share one rule, so with `with_rule` the
+    template gets the stored rule, too, if the version holds one.
+
+    Raises ChangedTracesError if one of these traces is missing or damaged; an event is written to
+    the store that names the damaged ones. Raises StoreError (KeyError, ValueError or
+    NotImplementedError, if it is of another reducer) for a state that this dengine cannot restore,
+    StoreError for a label that is neither 0 nor 1, for traces of different shapes, and if the store
+    does not answer, and what the training raises.
     """
+    state = version.state if with_rule else without_rule(version.state)
     model = template.successor()
-    if model.needs_refit(state) and not refit(model, outbox, TrainedOn.from_state(state)):
-        return None
-    return model.set_state(state)
-
-
-def refit(model: EngineModel, outbox: Outbox, trained_on: TrainedOn) -> bool:
-    """Train a model on the traces of a stored version, with the labels that these had then.
-
-    `trained_on` has the numbers of these labels, and that of the newest correction that they had.
-    The labels are first compared with the ledger, the store's hash chain. A difference sets the
-    outbox's `integrity_error`, after which every part is verified, and the model is trained
-    nevertheless. A trace whose label was forgotten by then is left out, and does not count as
-    missing.
-
-    Returns False, with the model untrained, if a trace is missing or damaged; an event is written
-    to the store that names the damaged ones. Raises StoreError if a label is neither 0 nor 1, if
-    the traces have different shapes, or if the store does not answer, and what `train` of the model
-    raises.
-    """
+    if not model.needs_refit(state):
+        return model.set_state(state)
     store = outbox.store
     first = int(trained_on.seq[0])
     last = int(trained_on.seq[-1])
-    outbox.check_integrity(
-        first - 1
-    )  # the traces are older than the newest ones, which were checked
+    outbox.check_integrity(first - 1)  # of the newest labels alone it was checked
     data = store.labels.with_traces(first=first, last=last, corrected_to=trained_on.corrected_to)
     kept = np.isin(data.seq, trained_on.seq)
     corrected = {
@@ -75,9 +68,12 @@ def refit(model: EngineModel, outbox: Outbox, trained_on: TrainedOn) -> bool:
     # A forgotten label is not among the data although nothing is damaged.
     n_forgotten = sum(corrected.get(seq, True) is None for seq in trained_on.seq.tolist())
     if kept.sum() + n_forgotten < len(trained_on.seq):
-        return False
+        raise ChangedTracesError(
+            f"Expected the traces that version {version.version} was fitted on as they were "
+            "stored, some have changed; see `dengine verify`, and restore the store from a copy."
+        )
     model.train(data.traces[kept], data.labels[kept], data.hashes[kept], numbers=data.seq[kept])
-    return True
+    return model.set_state(state)
 
 
 def find_clean_start(

@@ -13,7 +13,7 @@ from .. import __version__
 from ..decision.decider import DecisionConditions
 from ..decision.policy import NO_LIMITS, Policy
 from ..errors import ImportRefusedError, SettingError, StoreError, expect, listed, log, shortened
-from ..model.base import EngineModel, Model, as_engine_model
+from ..model.base import BaselineAdapter, EngineModel, Model
 from ..model.neighbours import ModelPrediction
 from ..recipe import OBJECT_PREFIX, Recipe, describe_estimator
 from ..records import TraceSpec, is_whole, stored_trace_spec
@@ -111,10 +111,8 @@ class EngineSettings:
         must be imported for a default of the recipe, and cannot be.
         """
         texts = {"recipe": self.recipe.to_toml(), "seed": str(self.seed), "dengine": __version__}
-        if self.model is not None:
-            texts["model"] = self.model
-        if self.described is not None:
-            texts["described"] = self.described
+        objects = {"model": self.model, "described": self.described}
+        texts |= {name: text for name, text in objects.items() if text is not None}
         if self.trace is not None:
             texts["trace"] = json.dumps(asdict(self.trace))
         numbers = {
@@ -197,27 +195,19 @@ class EngineSettings:
     def with_template(self, model: Model | None) -> tuple[Self, EngineModel]:
         """Return the settings in force and an untrained model: the recipe's, or `model` if given.
 
-        If a user passed an object in place of a name, the settings are a copy that describes it. A
-        `ModelPrediction`, dengine's own kind of model, as `model` also replaces the settings of the
-        recipe that it has itself, like the radius; for a baseline the recipe stays, though not all
-        of it has an effect. Without a `model` the recipe's reducer and the rule of its policy are
-        made, for which classes of the user's are imported. Raises SettingError if that fails, and
-        for a `model` that lacks a method of `Model`. These settings are not changed.
+        If a user passed an object in place of a name, the settings are a copy that describes it.
+        For a `model`, a baseline, the recipe stays, though not all of it has an effect. Without one
+        the recipe's reducer and the rule of its policy are made, for which classes of the user's
+        are imported. Raises SettingError if that fails, and for a `model` that is no baseline.
+        These settings are not changed.
         """
         if model is None:
             untrained = ModelPrediction.from_recipe(self.recipe, self.seed)
             if isinstance(self.recipe.reducer, str):  # a store may describe an object of that name
                 return self, untrained
             return replace(self, described=describe_estimator(self.recipe.reducer)), untrained
-        template = as_engine_model(model)
-        # The numbers of a ModelPrediction count; those of a baseline are its author's affair.
-        settings = replace(
-            self,
-            recipe=template.effective_recipe(self.recipe),
-            model=template.name,
-            described=template.description,
-        )
-        return settings, template
+        template = BaselineAdapter(model)
+        return replace(self, model=template.name, described=template.description), template
 
     def check_request(self, request: Settings) -> None:
         """Raise SettingError if settings that a program gives are not the settings in force.
@@ -293,7 +283,7 @@ def _with_objects(
             f"The engine of {name} has its own model, {recipe.name}; leave model=... out."
         )
     if model is not None:
-        _check_description(texts, name, as_engine_model(model).description)
+        _check_description(texts, name, BaselineAdapter(model).description)
         return recipe
     if recipe.name.startswith(OBJECT_PREFIX):
         if reducer is None or isinstance(reducer, str):
@@ -439,6 +429,14 @@ def check_model_settings(reducer: Any, given: Settings) -> None:
     effective = {name: getattr(Policy(), name) for name in BASELINE_SETTINGS}
     if policy is not None and replace(policy, **effective) != Policy():
         idle.append("policy")
+    refuse_idle(idle)
+
+
+def refuse_idle(idle: Collection[str]) -> None:
+    """Raise SettingError for settings that have no effect on a handed-in model, if there are any.
+
+    `idle` holds their names.
+    """
     if idle:
         raise SettingError(
             f"A model that is handed in decides by its own rule, so {', '.join(idle)} would have "

@@ -26,7 +26,7 @@ class EngineState:
     @property
     def new_labels(self) -> int:
         """Labels since the last retrain began."""
-        return self._learner.labels.new_labels
+        return self._learner.feedback.new_labels
 
     @property
     def is_retraining(self) -> bool:

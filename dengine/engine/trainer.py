@@ -23,6 +23,7 @@ from ..model.base import EngineModel
 from ..records import TRAINED, Ints, TraceArray
 from ..reducers.base import StopRule
 from ..store.records import LabelledTraces
+from .guard import NOT_PRECOMPUTED, guarded
 
 HUNG = 60.0  # seconds after which a training in the executor is given up
 # Share of the budget after which no step begins. It is smaller, down to the second, where the work
@@ -90,15 +91,10 @@ class TrainingWindow:
         are not changed.
         """
         n = len(self)
-        columns = [column[self._first :] for column in self._block]
-        room = n + max(n // 2, 64)
-        shapes: list[tuple[int, ...]] = [(room,), (room, *trace_shape), (room,), (room,)]
-        self._block = [
-            np.empty(shape, column.dtype) for shape, column in zip(shapes, columns, strict=True)
-        ]
-        if n:  # an empty window does not know the traces' shape
-            for new, old in zip(self._block, columns, strict=True):
-                new[:n] = old
+        shapes = ((), trace_shape, (), ())
+        for i, (column, shape) in enumerate(zip(self._block, shapes, strict=True)):
+            room = np.empty((max(n // 2, 64), *shape), column.dtype)
+            self._block[i] = np.concatenate([column[self._first :].reshape(n, *shape), room])
         self._first = 0
         self._end = n
 
@@ -119,19 +115,21 @@ class TrainingWindow:
         """
         return LabelledTraces(*[column[self._first : self._end] for column in self._block])
 
-    def newer(self, seq: int) -> list[int]:
-        """Return the sequence numbers of the window's labels after this one, in ascending order."""
+    def count_newer(self, seq: int) -> int:
+        """Return how many labels of the window have a number above this one."""
         numbers = self._block[0][self._first : self._end]
-        newer: list[int] = numbers[np.searchsorted(numbers, seq, "right") :].tolist()
-        return newer
+        return len(numbers) - int(np.searchsorted(numbers, seq, "right"))
 
-    def row(self, seq: int) -> tuple[TraceArray, int, int]:
-        """Return trace (channels, samples), label and hash of the label of this number.
+    def row_after(self, seq: int) -> tuple[int, TraceArray, int, int] | None:
+        """Return the first label of the window with a number above this one; None without any.
 
-        That it is in the window is not checked.
+        It is the label's number, its trace (channels, samples), the label and its hash.
         """
-        i = int(np.searchsorted(self._block[0][: self._end], seq))
-        return self._block[1][i], int(self._block[2][i]), int(self._block[3][i])
+        i = self._end - self.count_newer(seq)
+        if i == self._end:
+            return None
+        numbers, traces, labels, hashes = self._block
+        return int(numbers[i]), traces[i], int(labels[i]), int(hashes[i])
 
 
 @dataclass(frozen=True)
@@ -182,37 +180,6 @@ class TrainedOn:
         """Return the record that `to_state` turned into arrays."""
         pinned = int(state.get("pinned", 0))
         return cls(state["trained_on"], int(state["trained_as"]), int(state["counts_from"]), pinned)
-
-
-@dataclass(frozen=True)
-class Limits:
-    """Limits of a retrain; None is no limit.
-
-    Attributes
-    ----------
-    budget : float or None
-        Seconds of wall time.
-    max_steps : int or None
-        Optimiser steps.
-    reserve : float
-        Seconds of the budget that are kept for the last step and the work after it.
-    """
-
-    budget: float | None = None
-    max_steps: int | None = None
-    reserve: float = 0.0
-
-    def deadline(self, begin: float) -> float | None:
-        """Return the time after which a training begins no step, if it began at `begin`.
-
-        Both are in seconds by the same clock. It is after 70 % of the time budget, or when
-        `reserve` seconds of it are left if that is earlier, but not before 30 %. None without a
-        budget.
-        """
-        if self.budget is None:
-            return None
-        seconds = min(STEPS * self.budget, self.budget - self.reserve)
-        return begin + max(FEWEST_STEPS * self.budget, seconds)
 
 
 @dataclass(frozen=True)
@@ -268,10 +235,13 @@ class Retrainer:
     Parameters
     ----------
     window : TrainingWindow
-    limits : Limits
+    budget : float or None
+        Seconds of wall time of a retrain; None: no limit.
+    max_steps : int or None
+        Optimiser steps of a retrain; None: no limit.
     executor : concurrent.futures.Executor or None
         A `RestartableExecutor` that died or hangs is started again. Any other one is set to None
-        when it died or takes no more work.
+        when it died, hangs or takes no more work.
     clock : callable
         Seconds, of any origin; it must pickle for a process executor.
 
@@ -284,23 +254,31 @@ class Retrainer:
     def __init__(
         self,
         window: TrainingWindow,
-        limits: Limits,
+        budget: float | None,
+        max_steps: int | None,
         executor: Executor | None,
         clock: Clock = time.perf_counter,
     ) -> None:
         self.window = window
-        self.limits = limits
+        self.budget = budget
+        self.max_steps = max_steps
         self.executor = executor
         self.clock = clock
         self.future: Future[Trained] | None = None
-        self._left: Future[Trained] | None = None  # nobody wants it, and it may still be at work
         self._began = 0.0  # when the executor could begin with the training, by `time.monotonic`
         self._seq = np.zeros(0, dtype=np.int64)  # the labels that it was given
         self._last_seconds = deque([0.0], N_REMEMBERED)  # of the newest trainings
 
-    def _limits(self) -> Limits:
-        """Return the limits of the next training, with the reserve that the last ones needed."""
-        return replace(self.limits, reserve=max(self._last_seconds))
+    def _step_seconds(self) -> float | None:
+        """Return the seconds after which the next training begins no step; None without a budget.
+
+        They are 70 % of the time budget, or less if the newest trainings took longer for their last
+        step and the work after it, but not less than 30 %.
+        """
+        if self.budget is None:
+            return None
+        seconds = min(STEPS * self.budget, self.budget - max(self._last_seconds))
+        return max(FEWEST_STEPS * self.budget, seconds)
 
     def train(self, current: EngineModel, begin: float) -> Trained:
         """Train a successor of the current model in this thread, and return the outcome.
@@ -313,7 +291,8 @@ class Retrainer:
         next. This thread then has one torch thread.
         """
         data = self.window.snapshot()
-        trained = train_candidate(current.successor(), data, self._limits(), self.clock)
+        limits = (self._step_seconds(), self.max_steps)
+        trained = train_candidate(current.successor(), data, *limits, self.clock)
         self._last_seconds.append(trained.last_seconds)
         return replace(trained, begin=begin)
 
@@ -321,18 +300,18 @@ class Retrainer:
         """Begin to train a successor of the current model in the executor, on the present window.
 
         A successor starts from the weights of the current model, or from scratch. `collect` returns
-        the outcome; no other training may be under way. Returns False, and begins nothing, if there
-        is no executor, if it refuses work, or while it still works on a discarded training (also if
-        this is done by now, until `is_occupied` was read). An executor that refuses work is started
-        again or given up, and that is logged.
+        the outcome; no other training may be under way. It waits until the executor is done with a
+        discarded one. Returns False, and begins nothing, if there is no executor, or if it refuses
+        work. An executor that refuses work is started again or given up, and that is logged.
         """
         executor = self.executor
-        if executor is None or self._left is not None:
+        if executor is None:
             return False
         data = self.window.snapshot()
         if not self._began:
             log.info("the first retrain begins, on %s", counted(len(data.seq), "label"))
-        arguments = (current.successor(), data, self._limits(), self.clock)
+        limits = (self._step_seconds(), self.max_steps)
+        arguments = (current.successor(), data, *limits, self.clock)
         try:
             self.future = executor.submit(train_candidate, *arguments)
         except RuntimeError as error:
@@ -345,36 +324,19 @@ class Retrainer:
     def discard(self) -> bool:
         """Give up the training under way, without waiting; return whether there was one.
 
-        Its outcome is lost. If the executor has begun with it, it goes on working and takes no
-        other training until it is done (`is_occupied`).
+        Its outcome is lost. If the executor has begun with it, it goes on working, and the next
+        training begins when it is done.
         """
         future = self.future
         self.future = None
-        if future is not None and not future.cancel():
-            self._left = future
+        if future is not None:
+            future.cancel()
         return future is not None
 
     @property
     def is_done(self) -> bool:
         """Whether a training in the executor is done, and `collect` returns its outcome."""
         return self.future is not None and self.future.done()
-
-    @property
-    def is_occupied(self) -> bool:
-        """Whether the executor still works on a training that was discarded.
-
-        A training that hangs, which is to say that it takes longer than HUNG (60 s), does not
-        count: reading this then starts the executor again, or if that cannot be done, leaves it
-        unused until the training is done.
-        """
-        left = self._left
-        if left is None or left.done():
-            self._left = None
-            return False
-        is_hung = self._count_seconds_left() <= 0.0
-        if is_hung:
-            self._replace_executor()
-        return not is_hung
 
     def _count_seconds_left(self) -> float:
         """Return how many seconds the executor's training has left, before it counts as hung.
@@ -415,9 +377,8 @@ class Retrainer:
         """Log why a training failed, and return it as the reason of a dropped retrain.
 
         `error` is what the training, or waiting for it, raised; the reason begins with "dropped: ".
-        If the training is not done and its executor lives, it is discarded: the executor takes no
-        other training until it is done. An executor that died, or in which a training hangs, is
-        started again if it can be, or not used.
+        If the training is not done and its executor lives, it is discarded. An executor that died,
+        or in which a training hangs, is started again if it can be, or not used.
         """
         is_broken = isinstance(error, BrokenExecutor)
         training_raised = future.done() and not is_broken
@@ -426,7 +387,7 @@ class Retrainer:
             return f"dropped: {reason_of(error)}"
         failure = f"{type(error).__name__}: {error}"
         if not is_broken:
-            self.discard()
+            future.cancel()
             seconds = time.monotonic() - self._began
             failure = f"not done after {seconds:.0f} s in the executor."
         if is_broken or self._count_seconds_left() <= 0.0:
@@ -436,39 +397,44 @@ class Retrainer:
     def _replace_executor(self) -> None:
         """Start a `RestartableExecutor` again; go on without any other executor.
 
-        A restart ends what it works on, also a discarded training. If it raises OSError, that is
-        logged, and the next retrain tries again. Any other executor is set to None, which is
-        logged. But if it still works on a discarded training, it is kept, and used again once that
-        is done.
+        A restart ends what it works on. If it raises OSError, that is logged, and the next retrain
+        tries again. Any other executor is set to None, which is logged.
         """
         executor = self.executor
         if isinstance(executor, RestartableExecutor):
-            self._left = None
             try:
                 executor.restart()
             except OSError:
                 log.exception("retrains are in line until their process can be started again")
-        elif self._left is None:
+        else:
             self.executor = None
             log.error("retrains are in line from now on")
 
 
 def train_candidate(
-    successor: EngineModel, data: LabelledTraces, limits: Limits, clock: Clock
+    successor: EngineModel,
+    data: LabelledTraces,
+    step_seconds: float | None,
+    max_steps: int | None,
+    clock: Clock,
 ) -> Trained:
     """Train a model on labelled traces and return the outcome.
 
     The outcome has the model, a reason in words, the number of steps, the duration, and the numbers
-    of the labels. `successor` is the model, which this changes in place. Any exception, a window
+    of the labels. `successor` is the model, which this changes in place. No step begins after
+    `step_seconds`, and after `max_steps` steps; None is no limit. Any exception, a window
     without traces, and a defect of the trained model give an outcome without a model, whose reason
     begins with "dropped: ". A training that reaches a limit ends early and is accepted; its reason
     says so if the time budget ended it before its last step, and has the note of the model's report
-    if there is one. `clock` returns seconds. Nothing is logged. Sets the present thread to one
-    torch thread. It is a plain function, so that any executor can run it.
+    if there is one. `clock` returns seconds. The modules that a training imports are loaded first;
+    their time does not count, and a failure of this is logged. Sets the present thread to one torch
+    thread. It is a plain function, so that any executor can run it.
     """
     torch.set_num_threads(1)  # it holds for the present thread only
+    guarded(NOT_PRECOMPUTED, successor.warm_up)
     begin = clock()
-    stop = StopRule(limits.deadline(begin), limits.max_steps, clock)
+    deadline = None if step_seconds is None else begin + step_seconds
+    stop = StopRule(deadline, max_steps, clock)
     model: EngineModel | None = None
     n_steps = 0
     try:

@@ -164,7 +164,7 @@ def prepare_export(
     points = model.spaces.embed(examples) / model.scale[:, None] if len(examples) else examples
     try:
         decider = model.build_decider(conditions)
-        defect = next(filter(None, compare_points(decider, examples, points)), "")
+        defect = compare_points(decider, examples, points)
     except (RuntimeError, torch.jit.Error, torch.jit.frontend.FrontendError) as error:
         defect = f"it does not run as TorchScript, {reason_of(error)}"
     if defect:

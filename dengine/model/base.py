@@ -1,6 +1,6 @@
 """The two interfaces of a model: `Model` for baselines, `EngineModel` for the engine. The file also
-holds `Prediction`, what a model answers; `BaselineAdapter`, by which `as_engine_model` makes an
-`EngineModel` of a baseline; and `Exportable`, what a model hands to an exporter. dengine's own
+holds `Prediction`, what a model answers; `BaselineAdapter`, which makes an `EngineModel` of a
+baseline; and `Exportable`, what a model hands to an exporter. dengine's own
 `neighbours.ModelPrediction` implements both interfaces.
 
 Calls that must not raise into the cell go through `engine.guard.guarded`.
@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import copy
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Protocol, Self, runtime_checkable
 
@@ -20,11 +20,11 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from ..decision.decider import Decider, DecisionConditions, Predicted, Verdict
+from ..decision.neighbours import CERTAIN, UNCERTAIN
 from ..decision.policy import Policy
 from ..errors import SettingError, shortened
 from ..limits import ForceLimits
-from ..recipe import Recipe
-from ..records import ACTIONS, REASONS, Action, Arrays, Reason, State, TraceSpec
+from ..records import ACTIONS, Action, Arrays, Reason, State, TraceSpec
 from ..reducers.base import FitReport, Floats, Ints, StopRule
 from ..traces import clip_extremes
 
@@ -73,7 +73,7 @@ class Model(Protocol):
 class EngineModel(ABC):
     """The model that the engine drives: it predicts, learns references, retrains and is stored.
 
-    A subclass implements `train`, `predict_one`, `add_reference` and `successor`; every other
+    A subclass implements `train`, `build_decider`, `add_reference` and `successor`; every other
     method has a default that fits a model without a rule, without a safe mode and without a stored
     state.
 
@@ -83,9 +83,6 @@ class EngineModel(ABC):
         What `DataEngine.model` shows: the model as its author knows it.
     name : str
         Shown in a status or a table.
-    description : str
-        The model and its numbers, the same at every start: a store compares it with the model that
-        made it.
     rule_is_stale : bool
         An update of the rule failed, so the model raises instead of predicting until the engine is
         opened again.
@@ -105,16 +102,8 @@ class EngineModel(ABC):
 
     user_model: Any
     name: str
-    description: str
     _decider: Decider | None = None
     _conditions: DecisionConditions | None = None
-
-    def effective_recipe(self, recipe: Recipe) -> Recipe:
-        """Return the recipe with this model's own settings in place of those that have no effect.
-
-        The default returns the recipe unchanged.
-        """
-        return recipe
 
     @abstractmethod
     def train(
@@ -145,7 +134,7 @@ class EngineModel(ABC):
         """
 
     def warm_up(self) -> None:  # noqa: B027  # a default: nothing to load
-        """Load the libraries that the first training needs; called in a thread of its own.
+        """Load the libraries that the first training needs; called before each training.
 
         The default does nothing.
         """
@@ -157,20 +146,13 @@ class EngineModel(ABC):
         engine calls it in a thread, and logs what it raises. The default does nothing.
         """
 
-    @abstractmethod
-    def predict_one(self, x: Floats, hash_: int = 0) -> Prediction:
-        """Predict one trace (channels, samples).
-
-        `hash_` is the hash of its part, whose references are not counted; 0 excludes none. What it
-        raises reaches the caller of `decide_one`; an engine verifies the part then.
-        """
-
     def decide_one(self, x: Floats, part_hash: int, conditions: DecisionConditions) -> Verdict:
-        """Decide on one trace: check faults and force limits, ask `predict_one`, and draw audits.
+        """Decide on one trace: check faults and force limits, predict, and draw audits.
 
-        `predict_one` is asked only if the trace has no fault and is within the limits; what it
-        raises is raised here. An audit verifies a part that the model was certain of; whether it is
-        drawn is a fixed function of the trace's content hash and the seed.
+        The model predicts only if the trace has no fault and is within the limits; what it raises
+        is raised here, and an engine verifies the part then. An audit verifies a part that the
+        model was certain of; whether it is drawn is a fixed function of the trace's content hash
+        and the seed.
 
         Parameters
         ----------
@@ -206,13 +188,13 @@ class EngineModel(ABC):
             self._conditions = conditions
         return self._decider
 
+    @abstractmethod
     def build_decider(self, conditions: Any) -> Decider:
-        """Build a decider for these conditions, which asks this model's `predict_one`.
+        """Build a decider for these conditions, which asks this model.
 
         It is returned, not kept; `decider` keeps one. Raises SettingError if the force limits do
         not fit the traces.
         """
-        return Decider(PythonPredictor(self), conditions)
 
     @abstractmethod
     def add_reference(
@@ -332,13 +314,12 @@ class EngineModel(ABC):
         """
         return ""
 
-    def check_answers(self) -> Iterator[str]:
-        """Decide on some training traces, one with each step of the iterator.
+    def check_answers(self) -> str:
+        """Decide on some training traces; return why the model must not be used, "" if it may be.
 
-        For each trace it yields why the model must not be used, or "" if it may be used. It is
-        called in the process that will decide, after `prepare`. The default yields nothing.
+        It is called in the process that will decide, after `prepare`. The default returns "".
         """
-        return iter(())
+        return ""
 
     @property
     def report(self) -> FitReport:
@@ -364,69 +345,42 @@ class EngineModel(ABC):
         return True
 
 
-class PythonPredictor(nn.Module):
-    """Lets a `Decider` ask a model that runs in Python.
-
-    Parameters
-    ----------
-    model : EngineModel
-        Its `predict_one` is called.
-    """
-
-    def __init__(self, model: EngineModel) -> None:
-        super().__init__()
-        self.model = model
-
-    def forward(self, x: Tensor, part: int = 0) -> Predicted:
-        """Predict one trace (C, T) by the model's `predict_one`; `part` is the hash of its part.
-
-        Returns the positions of action and reason in `ACTIONS` and `REASONS`, the bounds of the
-        success probability, the label counts n_success and n_failure, and an embedding that is
-        always empty, shape (0, 0). Raises what `predict_one` raises.
-        """
-        prediction = self.model.predict_one(x.numpy(), part)
-        action = ACTIONS.index(prediction.action)
-        reason = REASONS.index(prediction.reason)
-        counts = (prediction.n_success, prediction.n_failure)
-        bounds = (prediction.lower, prediction.upper)
-        return action, reason, *bounds, *counts, self.embed(x)
-
-    def embed(self, x: Tensor) -> Tensor:
-        """Return an empty embedding, shape (0, 0): the model has none."""
-        return torch.empty(0, 0)
-
-
-def as_engine_model(model: Model) -> EngineModel:
-    """Return the model itself if it is an `EngineModel`, else a baseline in a `BaselineAdapter`.
-
-    The baseline is not copied. Only the names of its methods are checked. Raises SettingError for a
-    class, and for an object that lacks a method of `Model`: fit, add, count, predict_interval or
-    decide.
-    """
-    if isinstance(model, EngineModel):
-        return model
-    if isinstance(model, type) or not isinstance(model, Model):
-        raise SettingError(
-            f"Expected a model with fit, add, count, predict_interval and decide, got {model!r}."
-        )
-    return BaselineAdapter(model)
-
-
 class BaselineAdapter(EngineModel):
     """Makes an `EngineModel` of a baseline, which decides by its own rule.
 
     An engine trains a deep copy of the baseline, see `successor`, so the present one goes on
-    answering.
+    answering. The baseline itself is not copied, and only the names of its methods are checked.
 
     Parameters
     ----------
     model : Model
-        A store compares only the name of its class, not its settings.
+
+    Attributes
+    ----------
+    description : str
+        Name of its class, the same at every start: a store compares it with the model that made it,
+        and not its settings.
+
+    Raises
+    ------
+    SettingError
+        For a class, for an object that lacks a method of `Model` (fit, add, count,
+        predict_interval or decide), and for a model of dengine's own.
     """
 
     keeps_references = False
 
     def __init__(self, model: Model) -> None:
+        if isinstance(model, type) or not isinstance(model, Model):
+            raise SettingError(
+                "Expected a model with fit, add, count, predict_interval and decide, "
+                f"got {model!r}."
+            )
+        if isinstance(model, EngineModel):
+            raise SettingError(
+                f"Expected a baseline, got a {type(model).__name__}; describe dengine's own model "
+                "by reducer=, policy= and recipe=."
+            )
         self.model = model
         self.user_model = model
         self.name = type(model).__name__
@@ -440,28 +394,9 @@ class BaselineAdapter(EngineModel):
         self.model.fit(clip_extremes(X).copy(), y)
         return self
 
-    def predict_one(self, x: Floats, hash_: int = 0) -> Prediction:
-        """Return the decision of the baseline on one trace (channels, samples), as a `Prediction`.
-
-        It has the action, the bounds of the success probability and the label counts of the
-        baseline. The reason is UNCERTAIN for VERIFY, otherwise CERTAIN; there is no embedding.
-        `hash_` has no effect, because a baseline knows nothing of parts. Raises ValueError for an
-        unknown action, for other than one value of each, and for counts that are not whole numbers
-        from 0 to 2**63 - 1 (OverflowError for an infinite count). Errors of the baseline are raised
-        as they are, and bounds are not checked.
-        """
-        X = x[None]
-        (lower,), (upper,) = self.model.predict_interval(X)
-        (n_success,), (n_failure,) = self.model.count(X)
-        action = Action(self.model.decide(X)[0])
-        reason = Reason.UNCERTAIN if action is Action.VERIFY else Reason.CERTAIN
-        counts = (int(n_success), int(n_failure))
-        if counts != (n_success, n_failure) or not all(0 <= n < 2**63 for n in counts):
-            raise ValueError(
-                "Expected whole numbers of labels below 2**63, "
-                f"got {shortened((n_success, n_failure))}."
-            )
-        return Prediction(action, float(lower), float(upper), *counts, None, reason)
+    def build_decider(self, conditions: Any) -> Decider:
+        """Build a decider that asks the baseline; SettingError if force limits do not fit."""
+        return Decider(BaselinePredictor(self.model), conditions)
 
     def add_reference(self, x: Floats, y: int, *_: object, **__: object) -> Floats:
         """Pass the labelled trace to the baseline's `add`, which changes the baseline in place.
@@ -474,6 +409,47 @@ class BaselineAdapter(EngineModel):
 
     def successor(self) -> BaselineAdapter:
         return BaselineAdapter(copy.deepcopy(self.model))
+
+
+class BaselinePredictor(nn.Module):
+    """Lets a `Decider` ask a baseline.
+
+    Parameters
+    ----------
+    model : Model
+    """
+
+    def __init__(self, model: Model) -> None:
+        super().__init__()
+        self.model = model
+
+    def forward(self, x: Tensor, part: int = 0) -> Predicted:
+        """Predict one trace (C, T) by the baseline.
+
+        Returns the positions of action and reason in `ACTIONS` and `REASONS`, the bounds of the
+        success probability, the label counts n_success and n_failure, and an embedding that is
+        always empty, shape (0, 0). The reason is UNCERTAIN for VERIFY, otherwise CERTAIN. `part`
+        has no effect, because a baseline knows nothing of parts. Raises ValueError for an unknown
+        action, for other than one value of each, and for counts that are not whole numbers from 0
+        to 2**63 - 1 (OverflowError for an infinite count). Errors of the baseline are raised as
+        they are, and bounds are not checked.
+        """
+        X = x.numpy()[None]
+        (lower,), (upper,) = self.model.predict_interval(X)
+        (n_success,), (n_failure,) = self.model.count(X)
+        action = ACTIONS.index(Action(self.model.decide(X)[0]))
+        reason = CERTAIN if action else UNCERTAIN
+        counts = (int(n_success), int(n_failure))
+        if counts != (n_success, n_failure) or not all(0 <= n < 2**63 for n in counts):
+            raise ValueError(
+                "Expected whole numbers of labels below 2**63, "
+                f"got {shortened((n_success, n_failure))}."
+            )
+        return action, reason, float(lower), float(upper), *counts, self.embed(x)
+
+    def embed(self, x: Tensor) -> Tensor:
+        """Return an empty embedding, shape (0, 0): a baseline has none."""
+        return torch.empty(0, 0)
 
 
 @dataclass(frozen=True, slots=True)

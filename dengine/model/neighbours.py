@@ -14,8 +14,6 @@ compiles to TorchScript. Compiled deciders are copied from templates, because sc
 
 import copy
 import math
-from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from enum import Enum
 from types import BuiltinFunctionType, FunctionType
@@ -46,7 +44,7 @@ from ..decision.scripting import (
 )
 from ..errors import StoreError, expect
 from ..folds import content_hash, fold_of
-from ..recipe import NOVELTY, Recipe, describe_estimator
+from ..recipe import NOVELTY, Recipe
 from ..records import ACTIONS, REASONS, REPEATS, Arrays, Reason, State, TraceSpec, as_success
 from ..reducers import class_default, make_reducer
 from ..reducers.base import (
@@ -196,37 +194,30 @@ def structure_of(eager: nn.Module) -> tuple[Any, ...]:
     limits is left out, so that their number makes no difference. The class itself is in the key,
     not its name: a notebook cell that is run again defines another class.
     """
-    parts = [
+    return tuple(
         (path, type(module), _as_key(attributes_of(module)))
         for path, module in eager.named_modules(remove_duplicate=False)
         if not isinstance(module, ForceLimitsGate)  # limits may change in number
-    ]
-    return tuple(parts)
+    )
 
 
 def _as_key(value: object) -> object:
     """Return a hashable key of an attribute for `structure_of`; None if it makes no difference.
 
-    A list, tuple or dict gives its type and the sorted names and keys of its items. The key of an
-    item is the text of a constant, the shape of a tensor, and else its own `_as_key`. A function is
-    its own key: its address would not do, since another function may get it later. Any other value,
-    and so a constant outside a container, gives None.
+    It is the text of a constant and the shape of a tensor. A list, tuple or dict gives its type and
+    the sorted names of its items with their keys. A function is its own key: its address would not
+    do, since another function may get it later. Any other value gives None.
     """
     if isinstance(value, FUNCTIONS):
         return value
+    if isinstance(value, CONSTANTS):
+        return repr(value)
+    if isinstance(value, Tensor):
+        return tuple(value.shape)
     if not isinstance(value, list | tuple | dict):
         return None
-    keys: list[tuple[str, object]] = []
-    for name, item in value.items() if isinstance(value, dict) else enumerate(value):
-        key: object
-        if isinstance(item, CONSTANTS):
-            key = repr(item)
-        elif isinstance(item, Tensor):
-            key = tuple(item.shape)
-        else:
-            key = _as_key(item)
-        keys.append((repr(name), key))
-    return (type(value), *sorted(keys))
+    items = value.items() if isinstance(value, dict) else enumerate(value)
+    return (type(value), *sorted((repr(name), _as_key(item)) for name, item in items))
 
 
 def compiled(eager: Decider, warm_up_shape: tuple[int, ...]) -> Any:
@@ -240,16 +231,15 @@ def compiled(eager: Decider, warm_up_shape: tuple[int, ...]) -> Any:
     submodules = dict(module.named_modules(remove_duplicate=False))
     for path, submodule in eager.named_modules(remove_duplicate=False):
         for name, value in attributes_of(submodule).items():
-            is_container = isinstance(value, list | tuple | dict)
-            if isinstance(value, Tensor) or (is_container and has_tensor(value)):
+            if has_tensor(value):
                 setattr(submodules[path], name, value)
     return module
 
 
-def compare_points(decider: Decider, X: Floats, points: Floats) -> Iterator[str]:
+def compare_points(decider: Decider, X: Floats, points: Floats) -> str:
     """Compare the embeddings of a decider with the points of a reducer.
 
-    Each step of the iterator decides on one trace; what the decider raises is raised there.
+    What the decider raises is raised.
 
     Parameters
     ----------
@@ -259,17 +249,18 @@ def compare_points(decider: Decider, X: Floats, points: Floats) -> Iterator[str]
     points : array of float32, shape (n, K, d)
         The scaled embeddings that the reducer gives.
 
-    Yields
-    ------
+    Returns
+    -------
     str
-        For each trace a sentence on what is wrong; "" if the two agree (`is_close`, within 0.001),
-        and for a trace in which the decider finds a fault.
+        A sentence on what is wrong; "" if the two agree on each trace (`is_close`, within 0.001) in
+        which the decider finds no fault.
     """
     for x, expected in zip(X, points, strict=True):
         with torch.inference_mode():
             verdict = decider(torch.from_numpy(x), 0)
-        is_same = verdict[0] != 0 or is_close(verdict[9].numpy(), expected)
-        yield "" if is_same else OTHERWISE_COMPILED
+        if verdict[0] == 0 and not is_close(verdict[9].numpy(), expected):
+            return OTHERWISE_COMPILED
+    return ""
 
 
 def is_close(points: Floats, expected: Floats, tolerance: float = SAME_POINTS) -> bool:
@@ -363,35 +354,6 @@ class ModelPrediction(EngineModel):
         return self
 
     @property
-    def description(self) -> str:  # type: ignore[override]  # the rule may change
-        reducer = describe_estimator(self.reducer)
-        classifier = describe_estimator(self.classifier)
-        return f"{reducer} under {classifier}, {self.folds} folds, {type(self.rule).__name__}"
-
-    def effective_recipe(self, recipe: Recipe) -> Recipe:
-        """Return a copy of a recipe with the settings that this model really has.
-
-        Radius, alpha, lower bound and interval are taken from the model's classifier, folds and
-        novelty from the model. For fewer than 2 folds 2 is written, the least that a Recipe takes.
-        All else, such as the reducer and the window, stays as in the recipe. Raises SettingError
-        for a setting that `Recipe` or `Policy` refuses.
-        """
-        classifier = self.classifier
-        policy = replace(
-            recipe.policy,
-            alpha=classifier.alpha,
-            lower_bound=classifier.lower_bound,
-            interval=classifier.interval,
-        )
-        return replace(
-            recipe,
-            radius=classifier.radius,
-            policy=policy,
-            folds=max(2, self.folds),
-            novelty=self.novelty,
-        )
-
-    @property
     def n_spaces(self) -> int:
         """Number of spaces K: one for a reducer that uses no labels."""
         return self.spaces.n_spaces
@@ -466,9 +428,12 @@ class ModelPrediction(EngineModel):
         X = clip_extremes(X)
         y = y.astype(np.int64)
         is_one_part = len(X) >= MANY_OF_ONE and (hashes == hashes[0]).all()
-        actual = f"{len(X)} of one: all have its number, or are the same to 1/65536 of their unit"
-        do = "check part=, the sensor and the unit"
-        expect(not is_one_part, "traces of several parts", actual, do)
+        expect(
+            not is_one_part,
+            "traces of several parts",
+            f"{len(X)} of one: all have its number, or are the same to 1/65536 of their unit",
+            "check part=, the sensor and the unit",
+        )
         folds = fold_of(hashes, self.n_spaces)
         points = self.spaces.train(X, y, folds, stop, numbers)
         self.trace_shape = X.shape[1:]
@@ -495,39 +460,23 @@ class ModelPrediction(EngineModel):
         """Let the reducer compute in advance what a training on these traces (n, C, T) begins with.
 
         `numbers` are the labels' sequence numbers, by which the reducer finds its results again.
-        Extreme samples are clipped first. It computes in a thread of its own, with one thread of
-        torch, after its `untrained_module`, which may draw kernels, was asked for. Before the first
-        training, if reducer and decision rule can be compiled, the caller's thread compiles a
-        decider meanwhile, because the first retrain has no time for that; the process keeps it as a
-        template (`template_of`). The call returns when both are done, and raises what either raised
-        (the caller's thread first).
+        Extreme samples are clipped first. Before the first training, if reducer and decision rule
+        can be compiled, a decider without references is compiled as well, because the first retrain
+        has no time for that; the process keeps it as a template (`template_of`). Raises what
+        `template_of` and the reducer raise.
         """
         X = clip_extremes(X)
         encoder = self.spaces.untrained_module(X)
-        with ThreadPoolExecutor(1, "dengine-precompute", torch.set_num_threads, (1,)) as pool:
-            computing = pool.submit(self.spaces.precompute, X, numbers)
-            is_untrained = "index" not in vars(self)
-            is_scriptable = encoder is not None and self.rule.scriptable
-            if is_untrained and is_scriptable:
-                self._compile_template(encoder, X.shape[1:])
-            computing.result()
-
-    def _compile_template(self, encoder: Any, trace_shape: tuple[int, ...]) -> None:
-        """Compile a decider for traces of this shape (C, T), without references.
-
-        `encoder` is the module of the untrained reducer. The process keeps the compiled decider as
-        a template, from which `compiled` copies later deciders. Nothing in the model changes.
-        Raises what `template_of` raises.
-        """
-        channels, samples = trace_shape
-        gate = NoveltyGate(channels, samples)
-        gate.disabled = not self.novelty
-        references = RadiusIndex(encoder.dim, self.classifier.capacity)
-        neighbours = self.classifier.neighbours_over(references, self.rule, self.spaces.scores)
-        predictor = Predictor(encoder, torch.ones(self.n_spaces), gate, neighbours)
-        conditions = DecisionConditions(TraceSpec(samples, channels=channels))
-        decider = Decider(predictor, conditions, (self.n_spaces, encoder.dim))
-        template_of(decider.eval(), trace_shape)
+        self.spaces.precompute(X, numbers)
+        is_untrained = "index" not in vars(self)
+        if is_untrained and encoder is not None and self.rule.scriptable:
+            model = copy.copy(self)
+            model.trace_shape = X.shape[1:]
+            model.gate = NoveltyGate(*model.trace_shape)
+            model.gate.disabled = not self.novelty
+            model.index = RadiusIndex(encoder.dim, self.classifier.capacity)
+            model.scale = np.ones(self.n_spaces, np.float32)
+            template_of(model._eager_decider(encoder, None), model.trace_shape)
 
     def prepare(self, previous: EngineModel) -> None:
         """Take over the decision rule object of the previous model, and build the decider.
@@ -574,21 +523,24 @@ class ModelPrediction(EngineModel):
         RuntimeError, torch.jit.Error, FrontendError, OSError
             If TorchScript cannot compile or run the reducer's module, see `script`.
         """
-        conditions = conditions or DecisionConditions(self.trace_spec)
         encoder = self.spaces.module()
-        neighbours: Any = self.classifier.neighbours_over(self.index, self.rule, self.spaces.scores)
-        scale = torch.from_numpy(self.scale)
-        shape = (self.n_spaces, self.index.dim)
         if encoder is not None and self.rule.scriptable:
-            predictor = Predictor(encoder, scale, self.gate, neighbours)
-            decider: Decider = compiled(
-                Decider(predictor, conditions, shape).eval(), self.trace_shape
-            )
+            eager = self._eager_decider(encoder, conditions)
+            decider: Decider = compiled(eager, self.trace_shape)
             return decider
         encoder = InPython(self.spaces) if encoder is None else script(encoder)
-        neighbours = script(neighbours) if self.rule.scriptable else neighbours
-        predictor = Predictor(encoder, scale, script(self.gate), neighbours)
-        return Decider(predictor, conditions, shape).eval()
+        decider = self._eager_decider(encoder, conditions)
+        decider.predictor.novelty = script(self.gate)
+        if self.rule.scriptable:
+            decider.predictor.neighbours = script(decider.predictor.neighbours)
+        return decider
+
+    def _eager_decider(self, encoder: Any, conditions: DecisionConditions | None) -> Decider:
+        """Return a decider in Python for `build_decider`, around an encoder of traces."""
+        neighbours = self.classifier.neighbours_over(self.index, self.rule, self.spaces.scores)
+        predictor = Predictor(encoder, torch.from_numpy(self.scale), self.gate, neighbours)
+        conditions = conditions or DecisionConditions(self.trace_spec)
+        return Decider(predictor, conditions, (self.n_spaces, self.index.dim)).eval()
 
     @property
     def trace_spec(self) -> TraceSpec:
@@ -850,11 +802,11 @@ class ModelPrediction(EngineModel):
         answers = (restored.embed(self.examples) for _ in range(N_CHECKS))
         return "" if all(is_close(z, points, SAME_BATCH) for z in answers) else NOT_RESTORED
 
-    def check_answers(self) -> Iterator[str]:
+    def check_answers(self) -> str:
         """Compare the decider's embeddings of `examples` with the points that `defect` kept.
 
-        Yields for each example why the model must not be used, "" if it may be used. Call `defect`
-        before. The call raises what `build_decider` raises, and a step what the decider raises.
+        Returns why the model must not be used, "" if it may be used. Call `defect` before. Raises
+        what `build_decider` raises, and what the decider raises.
         """
         decider = self.decider(self._conditions)
         return compare_points(decider, self.examples, self._example_points)
@@ -955,11 +907,11 @@ def near_repeats(traces: Floats, parts: NDArray[np.int64]) -> int:
     scale = means.std((0, 2), keepdims=True)
     scaled = (means - means.mean(0)) / np.where(scale > 0, scale, 1.0)
     rows = torch.from_numpy(scaled.reshape(n, -1))
-    distances = torch.cdist(rows, rows)
-    distances[torch.from_numpy(parts[:, None] == parts)] = torch.inf
-    nearest = distances.numpy().min(1)
+    distances = torch.cdist(rows, rows).numpy()
+    distances[parts[:, None] == parts] = np.inf
+    nearest = distances.min(1)
     # A quarter of the time of `kthvalue`.
-    tenth = np.partition(distances.numpy(), NEIGHBOURS)[:, NEIGHBOURS]
+    tenth = np.partition(distances, NEIGHBOURS)[:, NEIGHBOURS]
     return int(((nearest < NEAR * tenth) & (tenth > 1e-6)).sum())
 
 
@@ -972,8 +924,7 @@ def repeats_note(traces: Floats, parts: NDArray[np.int64]) -> str:
     n_repeats = near_repeats(traces, parts)
     if n_repeats <= MANY_REPEATS:
         return ""
-    n_compared = min(len(traces), NEWEST)
     return (
-        f"{n_repeats} of the newest {n_compared} {REPEATS}: "
+        f"{n_repeats} of the newest {min(len(traces), NEWEST)} {REPEATS}: "
         "if parts come twice, give their numbers (part=)"
     )

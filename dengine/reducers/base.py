@@ -238,7 +238,7 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
         """
 
     def warm_up(self) -> None:  # a default: nothing to load
-        """Import what the first training needs. An engine calls it in a thread at its start.
+        """Import what the first training needs. An engine calls it before each training.
 
         The default does nothing.
         """

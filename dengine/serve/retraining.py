@@ -17,6 +17,7 @@ import pickle
 import signal
 import threading
 import weakref
+from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from multiprocessing.connection import wait
@@ -73,10 +74,10 @@ class RetrainingProcess(Executor):
     def submit(self, fn: Callable[..., T], /, *args: Any, **kwargs: Any) -> Future[T]:
         """Queue a call of a picklable function, which runs in the process after earlier calls.
 
-        Returns the future of its result. Wait for it before you submit the next call: the end of
-        the next call closes the file that holds the result. An exception of the call, or an
-        argument or result that cannot be pickled, is the future's. Raises BrokenExecutor if the
-        process has ended, and RuntimeError after `shutdown`.
+        Returns the future of its result. Wait for it before you submit two more calls: the end of
+        the second closes the file that holds the result. An exception of the call, or an argument
+        or result that cannot be pickled, is the future's. Raises BrokenExecutor if the process has
+        ended, and RuntimeError after `shutdown`.
         """
         call = _SharedPickle((fn, args, kwargs))
         return self._pool.submit(_call, call)  # type: ignore[arg-type]  # arrives as the tuple
@@ -122,19 +123,19 @@ def _unpickle(path: str) -> Any:
         return pickle.load(file)
 
 
-_NEWEST_RESULT: list[_SharedPickle] = []  # of the last call, until the next one ends
+_NEWEST_RESULTS: deque[_SharedPickle] = deque(maxlen=2)  # a discarded one, and the next
 
 
 def _call(call: tuple[Callable[..., Any], tuple[Any, ...], dict[str, Any]]) -> _SharedPickle:
     """Call a function, in the retraining process, and return its result for pickling.
 
-    `call` is the function, its arguments and its keyword arguments. The result is kept until the
-    next call ends; before that the server's process must have read it. Raises what the function
+    `call` is the function, its arguments and its keyword arguments. The result is kept until two
+    more calls end; before that the server's process must have read it. Raises what the function
     raises.
     """
     fn, args, kwargs = call
-    _NEWEST_RESULT[:] = [_SharedPickle(fn(*args, **kwargs))]
-    return _NEWEST_RESULT[0]
+    _NEWEST_RESULTS.append(_SharedPickle(fn(*args, **kwargs)))
+    return _NEWEST_RESULTS[-1]
 
 
 def _prepare_process() -> None:

@@ -192,12 +192,12 @@ def copy(file, tmp_path):
     return target
 
 
-@pytest.mark.parametrize("kind", ["flip", "truncation", "swap"])
+@pytest.mark.parametrize("kind", ["flip", "truncation", "block"])
 def test_every_damaged_file_is_refused(copy, kind):
     content, rng = copy.read_bytes(), np.random.default_rng(1)
     for i, j in np.sort(rng.integers(len(content) - 512, size=(20, 2))).tolist():
-        flipped, other_block = bytes([content[i] ^ 1 << j % 8]), content[j : j + 512]
-        written = {"flip": flipped, "truncation": b"", "swap": other_block}[kind]
+        flipped, other_block = bytes([content[i] ^ 1 << j % 8]), rng.bytes(512)
+        written = {"flip": flipped, "truncation": b"", "block": other_block}[kind]
         rest = b"" if kind == "truncation" else content[i + len(written) :]
         copy.write_bytes(changed := content[:i] + written + rest)
         if changed == content:  # both blocks are padding

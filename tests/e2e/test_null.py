@@ -12,11 +12,9 @@ from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
 from dengine import (
     DataEngine,
     Dataset,
-    ModelPrediction,
     Policy,
     Recipe,
     Replay,
-    WilsonRadiusClassifier,
     replay,
 )
 from dengine.recipe import RECIPES
@@ -73,11 +71,8 @@ def with_lda(honest: bool, data: Dataset, seed: int) -> Replay:
     reducer = (
         LinearDiscriminantAnalysis() if honest else SeesEverything(LinearDiscriminantAnalysis())
     )
-    model = ModelPrediction(
-        reducer, WilsonRadiusClassifier(0.3, POLICY.alpha, POLICY.lower_bound), folds=2
-    )
-    engine = DataEngine(recipe=Recipe("pca", policy=POLICY), model=model, seed=seed, replaying=True)
-    return replay(data, engine, seed)
+    recipe = Recipe(reducer, radius=0.3, folds=2, policy=POLICY)
+    return replay(data, DataEngine(recipe=recipe, seed=seed, replaying=True), seed)
 
 
 def test_the_same_labels_counted_where_they_were_fitted_are_caught(make_data, proof_repeats):

@@ -6,7 +6,6 @@ from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from threading import Event
-from threading import enumerate as living_threads
 from unittest.mock import Mock
 
 import numpy as np
@@ -257,12 +256,10 @@ def test_a_retrain_leaves_the_time_that_the_last_one_needed_after_its_steps(data
 
 
 @pytest.mark.slow
-def test_an_engine_that_retrains_itself_has_loaded_what_a_retrain_imports():
-    words = "import dengine, sys; dengine.DataEngine(); assert 'torch._dynamo' in sys.modules"
+@pytest.mark.parametrize(
+    "words", ["DataEngine()", "next(DataEngine(executor=Pool(1)).run(ReplayCell('insertion'), 1))"]
+)
+def test_an_engine_that_retrains_itself_and_a_run_have_loaded_what_a_retrain_imports(words):
+    imports = "from concurrent.futures import ThreadPoolExecutor as Pool; from dengine import *"
+    words = f"{imports}; import sys; {words}; assert 'torch._dynamo' in sys.modules"
     subprocess.check_call([sys.executable, "-c", words])
-
-
-def test_a_run_begins_once_what_a_retrain_imports_is_loaded(data):
-    with ThreadPoolExecutor(1) as pool, DataEngine("conv", executor=pool) as engine:
-        next(engine.run(ReplayCell(data), 1))
-        assert "dengine-warm-up" not in {thread.name for thread in living_threads()}

@@ -207,13 +207,11 @@ def test_a_parts_hash_never_changes():
         assert part_hash(text) % 2**64 == expected
 
 
-def test_an_event_and_the_status_tell_where_nearly_every_trace_is_novel(stream):
+def test_the_status_tells_where_nearly_every_trace_is_novel(stream):
     engine = make(LOCAL)
     play(engine, stream, 0, 120)
-    assert engine.store.events.newest() == []
     for x in stream.X[:200]:
         engine.decide(3 * x)
-    assert [event.kind for event in engine.store.events.newest()] == ["novelty"]
     assert "novel" in status(engine.store, last=200).alarm
 
 

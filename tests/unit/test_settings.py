@@ -19,7 +19,6 @@ from dengine import (
     Policy,
     Recipe,
     TraceSpec,
-    WilsonRadiusClassifier,
 )
 from dengine.engine.settings import EngineSettings
 from dengine.errors import ImportRefusedError, SettingError, StoreError
@@ -55,6 +54,7 @@ REFUSED = [  # settings, and the words that say why not
       for given in ({"policy": POLICY}, {"radius": 0.1}, {"folds": 3}, {"reducer": "pca"})),
     *(({"model": model}, "Expected a model with fit, add, count") for model in (PCA(2), ModelPrediction, 3)),
     *(({"reducer": "pca", "seed": seed}, "seed of 0 or more") for seed in ("x", 1.5, -1, True)),
+    ({"model": ModelPrediction()}, "Expected a baseline, got a ModelPrediction"),
     ({"reducer": "nowhere:Reducer"}, "can be imported here"),
     ({"reducer": "dengine.recipe:Recipe"}, "has no fit and no transform"),
     ({"reducer": f"{__name__}:Halves"}, "has no get_params"),
@@ -160,15 +160,15 @@ def test_a_new_cell_with_limits_in_seconds_has_the_rate_of_its_product(tmp_path)
         DataEngine("pca", LIMITED)
 
 
-def ours(alpha: float = 0.2) -> ModelPrediction:
-    return ModelPrediction("pca", WilsonRadiusClassifier(0.5, alpha, 0.8))
+class Other(Counting):
+    """Another baseline."""
 
 
 @pytest.mark.parametrize(
     ("first", "then"),
     [
-        ({"model": ours(), "policy": Policy(audit_rate=0.1)}, {"model": ours(alpha=0.5)}),
-        ({"reducer": "pca"}, {"model": ours()}),
+        ({"model": Counting(), "policy": Policy(audit_rate=0.1)}, {"model": Other()}),
+        ({"reducer": "pca"}, {"model": Counting()}),
         ({"recipe": Recipe(PCA(2), policy=POLICY)}, {"reducer": PCA(3)}),
     ],
 )
