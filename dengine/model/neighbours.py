@@ -496,11 +496,10 @@ class ModelPrediction(EngineModel):
 
         `numbers` are the labels' sequence numbers, by which the reducer finds its results again.
         Extreme samples are clipped first. It computes in a thread of its own, with one thread of
-        torch, after its `untrained_module`, which may draw kernels, was asked for. Before the first
-        training, if reducer and decision rule can be compiled, the caller's thread compiles a
-        decider meanwhile, because the first retrain has no time for that; the process keeps it as a
-        template (`template_of`). The call returns when both are done, and raises what either raised
-        (the caller's thread first).
+        torch, after its `untrained_module` was asked for. Before the first training, if reducer and
+        decision rule can be compiled, the caller's thread compiles a decider meanwhile, because the
+        first retrain has no time for that; the process keeps it as a template (`template_of`). The
+        call returns when both are done, and raises what either raised (the caller's thread first).
         """
         X = clip_extremes(X)
         encoder = self.spaces.untrained_module(X)

@@ -32,16 +32,13 @@ class HeadsFit(NamedTuple):
         Weights, the bias last.
     left_out : Tensor of float64, shape (K, n)
         Leave-one-out logit of each row by each head, of use only if the row trains the head; the
-        logit of the base rate for heads in `at_base_rate`.
-    at_base_rate : list of int
-        Heads that predict their base rate.
+        logit of the base rate for a head that was replaced by it.
     n_steps : int
         Newton steps that were taken.
     """
 
     w: Tensor
     left_out: Tensor
-    at_base_rate: list[int]
     n_steps: int
 
 
@@ -148,7 +145,7 @@ def fit_heads(
     Returns
     -------
     HeadsFit
-        Weights, leave-one-out logits, heads that were replaced by the base rate, number of steps.
+        Weights, leave-one-out logits, number of steps.
     """
     problem = RidgeProblem.from_features(g, y, outside, l2)
     # Every head takes part in every product, whether it has converged or not: a product of another
@@ -194,7 +191,7 @@ def fit_heads(
 
 def base_rate_if_better(
     w: Tensor, left_out: Tensor, y: Tensor, mask: Tensor
-) -> tuple[Tensor, Tensor, list[int]]:
+) -> tuple[Tensor, Tensor]:
     """Replace each classifier head that does worse than its base rate by the base rate.
 
     The base rate is the share of successes among all rows that train the head. A head does worse if
@@ -217,16 +214,13 @@ def base_rate_if_better(
     w, left_out : Tensor
         New tensors like the arguments. For a head that was replaced, all weights but the bias are
         0, and its row of `left_out` is the logit of the base rate.
-    at_base_rate : list of int
-        The heads that were replaced.
     """
     rate = torch.logit((mask @ y) / mask.sum(1))[:, None].expand_as(left_out)
     # Of rows of one class, the rate has an infinite logit and a loss of NaN: the head stays.
     worse = masked_loss(left_out, y, mask) > masked_loss(rate, y, mask)
     w = torch.where(worse[:, None], 0.0, w)
     w[worse, -1] = rate[worse, 0]
-    left_out = torch.where(worse[:, None], rate, left_out)
-    return w, left_out, worse.nonzero().flatten().tolist()
+    return w, torch.where(worse[:, None], rate, left_out)
 
 
 def leave_one_out(problem: RidgeProblem, logits: Tensor, factors: Tensor) -> Tensor:

@@ -26,14 +26,12 @@ Econometrics Journal 21: cross-fitting.
 """
 
 import copy
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Self
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike, NDArray
-from sklearn.base import clone
+from numpy.typing import ArrayLike
 from sklearn.utils.validation import check_is_fitted
 from torch import Tensor, nn
 
@@ -44,19 +42,18 @@ from .base import (
     FitReport,
     Floats,
     Ints,
-    Reducer,
     StopRule,
-    binary_labels,
     check_classes,
-    folds_of,
+    draw_seed,
+    embed_in_chunks,
     points_in_fold_space,
-    seed_of,
+    training_masks,
 )
 from .logistic_heads import fit_heads, masked_loss
 from .preprocessing import averaging
+from .probability import MIN_TRACES, ProbabilityReducer
 from .rocket_features import CHUNK, RocketEncoder, compute_raw_features
 
-MIN_TRACES = 20  # of the first training
 MIN_FIRST_STEPS = 3  # of the first heads, even after the deadline; without any they tell nothing
 MAX_TRAINING_TRACES = 4000  # to which heads are fitted, which bounds the time of a training
 GROWTH = 1.5  # times as many traces, after which components are computed anew,
@@ -255,11 +252,12 @@ def weigh_towers(
 
 
 @dataclass(eq=False, repr=False, kw_only=True)
-class RocketReducer(Reducer):
+class RocketReducer(ProbabilityReducer):
     """Embed traces by random convolution kernels and cross-fitted classifier heads.
 
     The first axis of the embedding is the predicted probability of success. The second spreads the
-    points in pictures; it is small against the radius.
+    points in pictures; it is small against the radius. Of more than 4000 traces, the heads are
+    fitted to 4000.
 
     Parameters
     ----------
@@ -286,8 +284,6 @@ class RocketReducer(Reducer):
         Steps of the last fit.
     holdout_losses_ : array of float64, shape (K,)
         Leave-one-out log loss of the logit of each space, over the rows outside its fold.
-    note_ : str
-        One line for the operator.
 
     Examples
     --------
@@ -297,14 +293,6 @@ class RocketReducer(Reducer):
     (60, 2, 2)
     """
 
-    uses_labels = True
-    scores = True
-    min_traces = MIN_TRACES
-    own_unit = True
-    default_radius = 0.07  # of a probability: seven in a hundred, never rescaled
-
-    n_components: int = 2
-    folds: int = 5
     kernels: int = 28
     dilations: int = 5
     regions: int = 3
@@ -312,47 +300,10 @@ class RocketReducer(Reducer):
     width: int = 128
     l2: float = 0.5
     max_iter: int = 20
-    random_state: Any = 0
 
-    @property
-    def n_spaces(self) -> int:
-        return int(self.folds)
-
-    def fit(self, X: ArrayLike, y: ArrayLike | None = None, *, folds: Ints | None = None) -> Self:
-        """Draw the kernels anew and fit the classifier heads; earlier fits are discarded.
-
-        If it raises, the earlier fit may be lost already, as after SettingError for a single class.
-        Unlike `train` it takes fewer than 20 traces, too. Of more than 4000 traces, the heads are
-        fitted to 4000.
-
-        Parameters
-        ----------
-        X : array of float, shape (n, T) or (n, C, T)
-        y : array, shape (n,)
-            Labels of two classes; the one that sorts last is success.
-        folds : array of int64, shape (n,), optional
-            Fold of each trace, 0 to K - 1. None: by a hash of its content.
-
-        Returns
-        -------
-        self
-
-        Raises
-        ------
-        SettingError
-            If a parameter is out of its range, labels or folds do not fit the traces, a trace has
-            a single sample, or the traces outside a fold have a single class.
-        TraceError, ValueError, TypeError
-            If X is not of one of these shapes or sparse, a value is not finite, or all samples are
-            below 1e-12 but not all are 0 (`check_traces`).
-        """
-        traces = self.check_traces(X, reset=True)
-        labels = binary_labels(y, len(traces), type(self).__name__)
-        folds = folds_of(traces, self.folds, folds)
-        self._initialize(traces)
-        check_classes(labels, self.training_masks(folds))
+    def _fit(self, traces: Floats, labels: Ints, folds: Ints) -> None:
+        check_classes(labels, training_masks(folds, self.folds))
         self._fit_heads(self.raw_features(traces), labels, folds)
-        return self
 
     def train(
         self,
@@ -364,24 +315,23 @@ class RocketReducer(Reducer):
     ) -> Floats:
         """Fit the classifier heads, starting from their last weights; return the reference points.
 
-        The kernels are drawn at the first call of `train`, `precompute` or `untrained_module` and
-        stay. X are traces (n, C, T), y (n,) their labels 1 or 0, `folds` (n,) their folds.
-        `numbers` (n,), those of the labels, increasing, identify the traces: a trace that was in
-        the last call of `train` or `precompute` has its features in a cache. None: nothing is
-        cached, and traces are chosen by their rows. `stop` may end the Newton steps, but in the
-        first fit its deadline leaves them three. If there are more than 4000 traces, the heads are
-        fitted to 4000 of them, chosen by a hash of the numbers. The module `net_`, and so the
-        module that `module` returned before, is changed in place. The points are float32 (n, d),
-        row i in embedding space ``folds[i]``. Raises the errors of `check_traces`, and SettingError
-        for fewer than 20 traces, if the traces outside a fold have a single class, and at the first
-        call for a parameter out of its range or fewer than 2 samples.
+        The kernels are drawn at the first call of `train` or `precompute` and stay. X are traces
+        (n, C, T), y (n,) their labels 1 or 0, `folds` (n,) their folds. `numbers` (n,), those of
+        the labels, increasing, identify the traces: a trace that was in the last call of `train` or
+        `precompute` has its features in a cache. None: nothing is cached, and traces are chosen by
+        their rows. `stop` may end the Newton steps, but in the first fit its deadline leaves them
+        three. If there are more than 4000 traces, the heads are fitted to 4000 of them, chosen by a
+        hash of the numbers. The module `net_`, and so the module that `module` returned before, is
+        changed in place. The points are float32 (n, d), row i in embedding space ``folds[i]``.
+        Raises the errors of `check_traces`, and SettingError for fewer than 20 traces, if the
+        traces outside a fold have a single class, and at the first call for a parameter out of its
+        range or fewer than 2 samples.
         """
         do = "verify more parts first"
         expect(len(X) >= MIN_TRACES, f"at least {MIN_TRACES} traces", len(X), do)
         traces = self._check_and_initialize(X)
-        labels = binary_labels(y, len(X), type(self).__name__)
-        check_classes(labels, self.training_masks(folds))
-        return self.train_heads(traces, labels, folds, stop, numbers)
+        check_classes(y, training_masks(folds, self.folds))
+        return self.train_heads(traces, y, folds, stop, numbers)
 
     def train_heads(
         self,
@@ -396,30 +346,14 @@ class RocketReducer(Reducer):
         Call `init_encoder` first: otherwise all kernels are 0, and the result is meaningless
         without an error. Traces are (n, C, T), labels (n,) 1 or 0; they may be of one class. `stop`
         and `numbers`, those of the labels, which must increase, are as in `train`. `net_` is
-        changed in place; `towers_` and what a fit reports (`n_iter_`, `holdout_losses_`, `note_`)
+        changed in place; `towers_` and what a fit reports (`n_iter_`, `holdout_losses_`)
         are replaced, and with `numbers` the cache, which then has these traces alone. Returns the
         points of the traces, float32 (n, d), row i in embedding space ``folds[i]``, whose head did
         not see the label of row i.
         """
         raw = self.raw_features(traces, numbers)
         self._fit_heads(raw, labels, folds, stop, numbers)
-        with torch.inference_mode():
-            points = apply_in_chunks(self._embed_raw, raw, 16 * CHUNK)
-            return points_in_fold_space(points.numpy(), folds)
-
-    def untrained_module(self, X: Floats) -> FeatureEmbedding:
-        """Return the module that embeds traces, so that it can be compiled before the training.
-
-        It is `net_`, which later trainings change in place; before the first training its
-        classifier heads are 0. If no kernels are drawn yet, they are drawn here from the traces X
-        (n, C, T). If these are fewer than 20 (`MIN_TRACES`), the kernels are drawn in a clone,
-        whose module is returned, and this reducer stays as it is. Raises the errors of
-        `check_traces`, and SettingError for a parameter out of its range or fewer than 2 samples.
-        """
-        is_initialized = "net_" in vars(self)
-        reducer: Self = self if len(X) >= MIN_TRACES or is_initialized else clone(self)
-        reducer._check_and_initialize(X)
-        return reducer.net_
+        return points_in_fold_space(embed_in_chunks(self._embed_raw, raw, 16 * CHUNK), folds)
 
     def precompute(self, X: Floats, numbers: Ints | None = None) -> None:
         """Compute the features of traces (n, C, T), and cache them for the next `train`.
@@ -431,16 +365,6 @@ class RocketReducer(Reducer):
         """
         if len(X) >= MIN_TRACES:
             self.raw_features(self._check_and_initialize(X), numbers)
-
-    def _check_and_initialize(self, X: Floats) -> Floats:
-        """Check traces and return them as (n, C, T); build the module `net_` at the first call.
-
-        The first traces set the shape, the scales of the channels and the kernels. Raises the
-        errors of `check_traces`, and at the first call those of `build`.
-        """
-        if "net_" not in vars(self):
-            self._initialize(self.check_traces(X, reset=True))
-        return self.check_traces(X)
 
     def _initialize(self, traces: Floats) -> None:
         """Build the module `net_`, with channel scales and kernels from traces (n, C, T).
@@ -456,14 +380,15 @@ class RocketReducer(Reducer):
 
         `build` must have been called. No label is read.
         """
-        generator = np.random.default_rng(seed_of(self.random_state))
+        generator = np.random.default_rng(draw_seed(self.random_state))
         self.net_.encoder.learn(torch.from_numpy(traces), generator)
+        self.is_initialized_ = True
 
     def build(self, channels: int, samples: int, average: int) -> None:
         """Make the module `net_` for traces of this shape, with kernels and classifier heads of 0.
 
         `towers_` and the cache of features become empty, `n_fits_` and `n_component_traces_` 0;
-        what a fit reports (`n_iter_`, `holdout_losses_`, `note_`) stays. `average` is the number of
+        what a fit reports (`n_iter_`, `holdout_losses_`) stays. `average` is the number of
         samples that are averaged to one. Raises SettingError for a parameter out of its range or
         fewer than 2 samples.
         """
@@ -482,6 +407,7 @@ class RocketReducer(Reducer):
         )
         n_leading = min(N_LEADING, self.width, encoder.towers[0].stop)
         self.net_ = FeatureEmbedding(encoder, self.folds, self.n_components, n_leading).eval()
+        self.is_initialized_ = False  # until kernels are drawn or restored
         self.n_fits_ = 0
         self.n_component_traces_ = 0
         self.towers_: list[Tower] = []
@@ -503,8 +429,8 @@ class RocketReducer(Reducer):
         P), of at most 4000 (`sample_rows`). `labels` (n,) are 1 or 0; for `numbers` see `train`.
         `stop` may end each tower's Newton steps; in the first fit its deadline leaves three.
         Components are new at the first fit, after every 20, and for at least 1.5 times as many rows
-        as the last ones. Sets `towers_`, `n_iter_` (most steps of a tower), `holdout_losses_`,
-        `n_fits_`, and `note_` (heads at their base rate in every tower, or "").
+        as the last ones. Sets `towers_`, `n_iter_` (most steps of a tower), `holdout_losses_` and
+        `n_fits_`.
         """
         with torch.no_grad():
             grew = len(raw) >= GROWTH * self.n_component_traces_
@@ -518,19 +444,17 @@ class RocketReducer(Reducer):
                 folds = folds[rows]
             f = self.net_.encoder.scale_features(raw)
             y = torch.from_numpy(labels)
-            outside = torch.from_numpy(self.training_masks(folds))
+            outside = torch.from_numpy(training_masks(folds, self.folds))
             towers = []
             left_out = []
-            at_base_rate = []  # by tower, the heads that predict it
             steps = []
             for tower, features in zip(self.towers_, self._tower_features(f), strict=True):
                 g = tower.components(features)
-                w, logits, heads, n_steps = fit_heads(
+                w, logits, n_steps = fit_heads(
                     g, y, outside, tower.w, self.l2, self.max_iter, stop, min_steps
                 )
                 towers.append(tower._replace(w=w))
                 left_out.append(logits)
-                at_base_rate.append(set(heads))
                 steps.append(n_steps)
             penalties = [0.0] * (len(towers) - 1) + [PRODUCT_PENALTY]
             shares, losses = weigh_towers(left_out, penalties, y, outside)
@@ -539,9 +463,6 @@ class RocketReducer(Reducer):
         self.n_iter_ = max(steps)
         self.holdout_losses_ = losses.numpy()
         self.n_fits_ += 1
-        useless = ", ".join(map(str, sorted(set.intersection(*at_base_rate))))
-        note = f"head {useless} predicts the base rate, which has the smaller held-out loss"
-        self.note_ = note if useless else ""
 
     def _set_heads(self, towers: list[Tower], shares: list[Tensor]) -> None:
         """Write the classifier heads of all towers to `net_`, which then gives K logits.
@@ -567,10 +488,6 @@ class RocketReducer(Reducer):
         features = [f[:, columns] for columns in self.net_.encoder.towers]
         leading = self.towers_[0].components(features[0])[:, : self.net_.n_leading]
         return [*features, pairwise_products(leading)]
-
-    def training_masks(self, folds: Ints) -> NDArray[np.bool_]:
-        """Return masks (K, n): row k selects the traces outside fold k, which train head k."""
-        return np.asarray(folds != np.arange(self.folds)[:, None])
 
     def _compute_components(self, raw: Tensor) -> None:
         """Compute feature scales and principal components anew from unscaled features (n, P).
@@ -646,19 +563,13 @@ class RocketReducer(Reducer):
                 return compute_raw_features(encoder, traces)
             positions = np.searchsorted(self._numbers, numbers)
             is_new = np.append(self._numbers, -1)[positions] != numbers
-            if is_new.all():
-                positions = np.arange(len(positions))
-                self._raw = compute_raw_features(encoder, traces).numpy()
-            elif is_new.any():
-                positions[is_new] = len(self._raw) + np.arange(is_new.sum())
-                new_features = compute_raw_features(encoder, traces[is_new]).numpy()
-                self._raw = np.concatenate([self._raw, new_features])
-            self._numbers = numbers
+            positions[is_new] = len(self._raw) + np.arange(is_new.sum())
+            new_features = compute_raw_features(encoder, traces[is_new]).numpy()
+            raw = np.concatenate([self._raw, new_features])
             # A slice copies nothing; it is enough unless a trace in between has left.
-            if len(positions) > 0 and (np.diff(positions) == 1).all():
-                self._raw = self._raw[positions[0] : positions[-1] + 1]
-            else:
-                self._raw = self._raw[positions]
+            is_slice = (np.diff(positions) == 1).all()
+            self._raw = raw[positions[0] : positions[-1] + 1] if is_slice else raw[positions]
+            self._numbers = numbers
         return torch.from_numpy(self._raw)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Self:
@@ -673,25 +584,22 @@ class RocketReducer(Reducer):
 
     @property
     def report(self) -> FitReport:
-        """Return the report of the last fit: Newton steps, and heads that predict the base rate.
+        """Return the report of the last fit: its Newton steps.
 
         Raises NotFittedError before there are kernels, AttributeError before the first fit.
         """
         check_is_fitted(self, "net_")
-        return FitReport(self.n_iter_, self.note_)
+        return FitReport(self.n_iter_)
 
     def embed(self, X: ArrayLike) -> Floats:
         """Embed traces (n, T) or (n, C, T) in every embedding space; return float32 (n, K, d).
 
         The points in space k come from head k, the classifier that was fitted without the labels of
-        fold k. If kernels were drawn (`precompute`, `untrained_module`) but nothing was fitted, all
-        probabilities are 0.5. Raises NotFittedError before there are kernels, ValueError for traces
-        of another shape and for values that are not finite.
+        fold k. If kernels were drawn (`precompute`) but nothing was fitted, all probabilities are
+        0.5. Raises NotFittedError before there are kernels, ValueError for traces of another shape
+        and for values that are not finite.
         """
-        traces = self.check_traces(X)
-        with torch.inference_mode():
-            points: Floats = apply_in_chunks(self.net_, torch.from_numpy(traces)).numpy()
-        return points
+        return embed_in_chunks(self.net_, torch.from_numpy(self.check_traces(X)), CHUNK)
 
     def _embed_raw(self, raw: Tensor) -> Tensor:
         """Raw features (n, P) -> (n, K, d)."""
@@ -706,7 +614,7 @@ class RocketReducer(Reducer):
 
         They are the shape, the counters, the losses, the fields of each `Tower`, and the tensors of
         `net_`, whose names begin with "net.". The cache of features is not among them. Losses and
-        towers are not copies; `note_` is not in it. Raises NotFittedError before there are kernels,
+        towers are not copies. Raises NotFittedError before there are kernels,
         AttributeError before the first fit.
         """
         check_is_fitted(self, "net_")
@@ -723,7 +631,7 @@ class RocketReducer(Reducer):
     def set_state(self, state: Arrays) -> Self:
         """Restore what `get_state` returned, and return self; the parameters must be the same.
 
-        Afterwards the cache of features is empty and `note_`, a line for the operator, is "".
+        Afterwards the cache of features is empty.
         Raises SettingError for a parameter out of its range, and StoreError if the sizes do not
         follow from the parameters; then the fitted model is lost. Raises KeyError if shape,
         counters or losses are missing.
@@ -739,7 +647,7 @@ class RocketReducer(Reducer):
         self.n_component_traces_ = n_component_traces
         self.n_iter_ = n_iter
         self.holdout_losses_ = np.array(state["losses"])
-        self.note_ = ""
+        self.is_initialized_ = True
         return self
 
     def check(self) -> None:
@@ -749,15 +657,7 @@ class RocketReducer(Reducer):
         billion, `regions` is an integer from 1 to 16 and `groups` from 0 to 64, `n_components` is 1
         or 2, and `folds` at least 2. `l2` is above 0.
         """
-        integers = (
-            "n_components",
-            "folds",
-            "max_iter",
-            "kernels",
-            "dilations",
-            "regions",
-            "width",
-        )
+        integers = ("n_components", "folds", "max_iter", "kernels", "dilations", "regions", "width")
         for name in integers:
             value = getattr(self, name)
             expect(is_whole(value, 1, MAX_INTEGER), f"{name} >= 1, an integer", value)
@@ -778,8 +678,3 @@ def sample_rows(n: int, numbers: Ints | None) -> Ints:
     values = np.arange(n) if numbers is None else numbers
     hashes = values.astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15)
     return np.sort(np.argpartition(hashes, MAX_TRAINING_TRACES)[:MAX_TRAINING_TRACES])
-
-
-def apply_in_chunks(function: Callable[[Tensor], Tensor], x: Tensor, size: int = CHUNK) -> Tensor:
-    """Apply a function to x (n, ...) `size` rows at a time, and join what it returns."""
-    return torch.cat([function(x[i : i + size]) for i in range(0, max(1, len(x)), size)])

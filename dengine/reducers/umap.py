@@ -37,7 +37,16 @@ from torch import Tensor, nn
 from ..decision.scripting import arrays_with_prefix, module_state, restore
 from ..errors import SettingError, expect
 from ..records import Arrays, State, is_number, is_whole
-from .base import FitReport, Floats, Ints, Reducer, StopRule, as_points, draw_seed
+from .base import (
+    FitReport,
+    Floats,
+    Ints,
+    Reducer,
+    StopRule,
+    as_points,
+    draw_seed,
+    embed_in_chunks,
+)
 from .umap_graph import (
     CHUNK,
     Frames,
@@ -419,7 +428,6 @@ class UmapReducer(Reducer):
         )
         self.encoder_ = encoder.eval()
 
-    @torch.inference_mode()
     def embed(self, X: Floats) -> Floats:
         """Embed traces (n, T) or (n, C, T) among the references; return float32 (n, 1, d).
 
@@ -427,8 +435,7 @@ class UmapReducer(Reducer):
         traces of another shape.
         """
         check_is_fitted(self, "encoder_")
-        traces = torch.from_numpy(self.check_traces(X))
-        return torch.cat([self.encoder_(chunk) for chunk in torch.split(traces, CHUNK)]).numpy()
+        return embed_in_chunks(self.encoder_, torch.from_numpy(self.check_traces(X)), CHUNK)
 
     def untrained_module(self, X: Floats) -> UmapEncoder:
         """Return a module that can be compiled before the training on traces X (n, C, T).
