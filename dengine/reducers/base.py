@@ -335,11 +335,17 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
         """
         if not reset:
             check_is_fitted(self)
-        options = {"ensure_min_samples": int(reset), "estimator": self, "input_name": "X"}
         # Writeable, since torch warns of an array that it could not write to.
         x = np.asarray(
             check_array(
-                X, dtype=np.float32, order="C", allow_nd=True, force_writeable=True, **options
+                X,
+                dtype=np.float32,
+                order="C",
+                allow_nd=True,
+                force_writeable=True,
+                ensure_min_samples=int(reset),
+                estimator=self,
+                input_name="X",
             )
         )
         if x.ndim > 3 or 0 in x.shape[1:]:
@@ -511,11 +517,6 @@ def folds_of(traces: Floats, n_folds: int, folds: Any = None) -> Ints:
     return given
 
 
-def training_masks(folds: Ints, n_folds: int) -> NDArray[np.bool_]:
-    """Return masks (K, n): row k selects the traces outside fold k, on which model k is trained."""
-    return np.asarray(folds != np.arange(n_folds)[:, None])
-
-
 def check_classes(labels: Ints, masks: NDArray[np.bool_]) -> None:
     """Raise SettingError unless, for each fold, the labels (n,) outside it have both classes.
 
@@ -580,7 +581,7 @@ class _Wrapping(Reducer):
     @property
     def own_unit(self) -> bool:  # type: ignore[override]  # elsewhere a constant of the class
         """Return `own_unit` of the wrapped `Reducer`; False for another transformer."""
-        return self.reducer.own_unit if isinstance(self.reducer, Reducer) else False
+        return bool(getattr(self.reducer, "own_unit", False))
 
     def as_input(self, X: Floats) -> Any:
         """Return traces (n, C, T) as the wrapped transformer takes them.
@@ -648,7 +649,7 @@ class CrossFitted(_Wrapping):
         y : array, shape (n,)
             Labels of two classes; the clones get 1 for the one that sorts last, else 0.
         folds : array of int64, shape (n,), optional
-            Fold of each trace, 0 to K - 1; it is not checked. None: by a hash of its content.
+            Fold of each trace, 0 to K - 1. None: by a hash of its content.
 
         Returns
         -------
@@ -657,8 +658,8 @@ class CrossFitted(_Wrapping):
         Raises
         ------
         SettingError
-            If K is below 2, the labels are missing or not of two classes, or the traces outside a
-            fold have a single class.
+            If K is below 2, the labels are missing or not of two classes, folds do not fit the
+            traces, or the traces outside a fold have a single class.
         TraceError, ValueError, TypeError
             If X is not of one of these shapes or sparse, a value is not finite, or all samples are
             below 1e-12 but not all are 0 (`check_traces`). Errors of the clones are raised as they
@@ -667,9 +668,9 @@ class CrossFitted(_Wrapping):
         expect(self.folds >= 2, "folds >= 2 for a reducer that uses labels", self.folds)
         traces = self.check_traces(X, reset=True)
         labels = binary_labels(y, len(traces), type(self.reducer).__name__)
-        folds = content_fold(traces, self.folds) if folds is None else folds
+        folds = folds_of(traces, self.folds, folds)
         self.clones_ = [clone(self.reducer) for _ in range(self.folds)]
-        masks = training_masks(folds, self.folds)
+        masks = folds != np.arange(self.folds)[:, None]
         check_classes(labels, masks)
         # Clone k never sees the labels of fold k: they are counted in its space.
         for fitted, outside in zip(self.clones_, masks, strict=True):

@@ -69,15 +69,13 @@ class ConvNetwork(nn.Module):
         signals = channels // 2
         width = max(width // 3, min(width, 2 * width // signals))
         groups = members * signals  # a convolution sees one signal; the hidden layer sees all
-        strides = (4 if samples >= MIN_SAMPLES_OF_STRIDE_4 else 2, 2, 2)
+        stride = 4 if samples >= MIN_SAMPLES_OF_STRIDE_4 else 2
         self.convolutions = FoldableSequential(
-            *conv_layers(groups, 2, width, kernel=15, stride=strides[0]),
-            *conv_layers(groups, width, 2 * width, kernel=9, stride=strides[1]),
-            *conv_layers(groups, 2 * width, 2 * width, kernel=9, stride=strides[2]),
+            *conv_layers(groups, 2, width, kernel=15, stride=stride),
+            *conv_layers(groups, width, 2 * width, kernel=9, stride=2),
+            *conv_layers(groups, 2 * width, 2 * width, kernel=9, stride=2),
         )
-        positions = samples  # P, after the last convolution
-        for stride in strides:
-            positions = (positions - 1) // stride + 1
+        positions = -(-samples // (stride * 2 * 2))  # P, after the last convolution
         regions = min(N_REGIONS, positions)
         self.stride = positions // regions
         self.window = positions - (regions - 1) * self.stride  # so that regions cover the trace
@@ -205,7 +203,7 @@ class ConvReducer(TorchReducer):
         """
         if len(X) >= self.min_traces:
             traces = self._check_and_initialize(X)
-            self.rocket_.precompute(traces, numbers)
+            self.rocket_.raw_features(traces, numbers)
 
     def _initialize(self, traces: Floats) -> None:
         super()._initialize(traces)
@@ -255,9 +253,8 @@ class ConvReducer(TorchReducer):
 
         The logit of the first coordinate is the mean of those of the network and of `rocket_`.
         """
-        traces = self.check_traces(X)
-        points = torch.from_numpy(super().embed(traces))
-        return average_logits(points, torch.from_numpy(self.rocket_.embed(traces))).numpy()
+        points = torch.from_numpy(super().embed(X))
+        return average_logits(points, torch.from_numpy(self.rocket_.embed(X))).numpy()
 
     def module(self) -> ConvEncoder:
         check_is_fitted(self, "encoder_")

@@ -31,7 +31,7 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from sklearn.utils.validation import check_is_fitted
 from torch import Tensor, nn
 
@@ -47,7 +47,6 @@ from .base import (
     draw_seed,
     embed_in_chunks,
     points_in_fold_space,
-    training_masks,
 )
 from .logistic_heads import fit_heads, masked_loss
 from .preprocessing import averaging
@@ -302,8 +301,8 @@ class RocketReducer(ProbabilityReducer):
     max_iter: int = 20
 
     def _fit(self, traces: Floats, labels: Ints, folds: Ints) -> None:
-        check_classes(labels, training_masks(folds, self.folds))
-        self._fit_heads(self.raw_features(traces), labels, folds)
+        check_classes(labels, self.training_masks(folds))
+        self._fit_heads(self.raw_features(traces), labels, folds, StopRule())
 
     def train(
         self,
@@ -330,15 +329,15 @@ class RocketReducer(ProbabilityReducer):
         do = "verify more parts first"
         expect(len(X) >= MIN_TRACES, f"at least {MIN_TRACES} traces", len(X), do)
         traces = self._check_and_initialize(X)
-        check_classes(y, training_masks(folds, self.folds))
-        return self.train_heads(traces, y, folds, stop, numbers)
+        check_classes(y, self.training_masks(folds))
+        return self.train_heads(traces, y, folds, stop or StopRule(), numbers)
 
     def train_heads(
         self,
         traces: Floats,
         labels: Ints,
         folds: Ints,
-        stop: StopRule | None = None,
+        stop: StopRule,
         numbers: Ints | None = None,
     ) -> Floats:
         """Fit the classifier heads like `train`, but without checking the input.
@@ -420,7 +419,7 @@ class RocketReducer(ProbabilityReducer):
         raw: Tensor,
         labels: Ints,
         folds: Ints,
-        stop: StopRule | None = None,
+        stop: StopRule,
         numbers: Ints | None = None,
     ) -> None:
         """Fit the classifier heads of each `Tower`, and write them to `net_`, weighed to one logit.
@@ -444,28 +443,23 @@ class RocketReducer(ProbabilityReducer):
                 folds = folds[rows]
             f = self.net_.encoder.scale_features(raw)
             y = torch.from_numpy(labels)
-            outside = torch.from_numpy(training_masks(folds, self.folds))
-            towers = []
-            left_out = []
-            steps = []
+            outside = torch.from_numpy(self.training_masks(folds))
+            fits = []
             for tower, features in zip(self.towers_, self._tower_features(f), strict=True):
                 g = tower.components(features)
-                w, logits, n_steps = fit_heads(
-                    g, y, outside, tower.w, self.l2, self.max_iter, stop, min_steps
-                )
-                towers.append(tower._replace(w=w))
-                left_out.append(logits)
-                steps.append(n_steps)
-            penalties = [0.0] * (len(towers) - 1) + [PRODUCT_PENALTY]
-            shares, losses = weigh_towers(left_out, penalties, y, outside)
-            self._set_heads(towers, shares)
-        self.towers_ = towers
-        self.n_iter_ = max(steps)
+                fit = fit_heads(g, y, outside, tower.w, self.l2, self.max_iter, stop, min_steps)
+                fits.append(fit)
+            pairs = zip(self.towers_, fits, strict=True)
+            self.towers_ = [tower._replace(w=fit.w) for tower, fit in pairs]
+            penalties = [0.0] * (len(fits) - 1) + [PRODUCT_PENALTY]
+            shares, losses = weigh_towers([fit.left_out for fit in fits], penalties, y, outside)
+            self._set_heads(shares)
+        self.n_iter_ = max(fit.n_steps for fit in fits)
         self.holdout_losses_ = losses.numpy()
         self.n_fits_ += 1
 
-    def _set_heads(self, towers: list[Tower], shares: list[Tensor]) -> None:
-        """Write the classifier heads of all towers to `net_`, which then gives K logits.
+    def _set_heads(self, shares: list[Tensor]) -> None:
+        """Write the classifier heads of `towers_` to `net_`, which then gives K logits.
 
         Logit k of `net_`, for embedding space k, becomes the sum over the towers of share k times
         the tower's own logit k. `shares` has a tensor (K,) for each `Tower`; `weigh_towers` returns
@@ -475,7 +469,7 @@ class RocketReducer(ProbabilityReducer):
         logit_columns = slice(0, net.n_scores, self.n_components)
         net.bias[logit_columns] = 0.0
         weights = [*(net.weight[columns] for columns in net.encoder.towers), net.product_weight]
-        for tower, share, tower_weight in zip(towers, shares, weights, strict=False):
+        for tower, share, tower_weight in zip(self.towers_, shares, weights, strict=False):
             weight, bias = tower.heads()
             tower_weight[:, logit_columns] = share * weight
             net.bias[logit_columns] += share * bias
@@ -488,6 +482,10 @@ class RocketReducer(ProbabilityReducer):
         features = [f[:, columns] for columns in self.net_.encoder.towers]
         leading = self.towers_[0].components(features[0])[:, : self.net_.n_leading]
         return [*features, pairwise_products(leading)]
+
+    def training_masks(self, folds: Ints) -> NDArray[np.bool_]:
+        """Return masks (K, n): row k selects the traces outside fold k, which train head k."""
+        return np.asarray(folds != np.arange(self.folds)[:, None])
 
     def _compute_components(self, raw: Tensor) -> None:
         """Compute feature scales and principal components anew from unscaled features (n, P).
@@ -637,15 +635,13 @@ class RocketReducer(ProbabilityReducer):
         counters or losses are missing.
         """
         channels, samples = self.restore_shape(state)
-        average, n_fits, n_component_traces, n_iter = map(int, state["counts"])
+        average, *counts = map(int, state["counts"])
         self.build(channels, samples, average)
         restore(self.net_, arrays_with_prefix(state, "net."))
         fields = [arrays_with_prefix(state, f"{name}.").values() for name in Tower._fields]
         for arrays in zip(*fields, strict=True):
             self.towers_.append(Tower(*map(torch.from_numpy, map(np.array, arrays))))
-        self.n_fits_ = n_fits
-        self.n_component_traces_ = n_component_traces
-        self.n_iter_ = n_iter
+        self.n_fits_, self.n_component_traces_, self.n_iter_ = counts
         self.holdout_losses_ = np.array(state["losses"])
         self.is_initialized_ = True
         return self

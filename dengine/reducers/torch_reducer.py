@@ -521,11 +521,9 @@ class TorchReducer(ProbabilityReducer):
         or network that cannot be used. After an error do not use the reducer.
         """
         channels, samples = self.restore_shape(state)
-        average, seed, n_steps, n_steps_left, n_new_steps = map(int, state["counts"])
+        average, seed, *counts = map(int, state["counts"])
         self._build(channels, samples, average, seed)
-        self.n_steps_ = n_steps
-        self.n_steps_left_ = n_steps_left
-        self.n_new_steps_ = n_new_steps
+        self.n_steps_, self.n_steps_left_, self.n_new_steps_ = counts
         self.loss_ = float(state["loss"])
         for name, module in self._modules().items():
             # A state of an earlier release lacks buffers that are not persistent.
@@ -626,12 +624,12 @@ def draw_batches(
             "Check the sensor and the unit."
         )
     size = min(batch_size, smallest)
-    drawn = np.empty((steps, size, n_folds), dtype=np.int64)
-    for k, pool in enumerate(pools):
+    columns = []
+    for pool in pools:
         n_passes = -(-steps * size // len(pool))
         order = np.concatenate([rng.permutation(pool) for _ in range(n_passes)])
-        drawn[:, :, k] = order[: steps * size].reshape(steps, size)
-    yield from torch.from_numpy(drawn)
+        columns.append(order[: steps * size].reshape(steps, size))
+    yield from torch.from_numpy(np.stack(columns, axis=2))
 
 
 @cache

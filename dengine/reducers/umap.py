@@ -504,11 +504,8 @@ class UmapReducer(Reducer):
         KeyError if another array is missing. The parameters are not compared with the state.
         """
         channels, samples = self.restore_shape(state)
-        n_frames, seed, n_epochs, n_steps, n_new_steps = (int(value) for value in state["counts"])
-        self.seed_ = seed
-        self.n_epochs_ = n_epochs
-        self.n_steps_ = n_steps
-        self.n_new_steps_ = n_new_steps
+        n_frames, *counts = map(int, state["counts"])
+        self.seed_, self.n_epochs_, self.n_steps_, self.n_new_steps_ = counts
         self.make_frames_ = Frames(channels, samples, n_frames)
         restore(self.make_frames_, arrays_with_prefix(state, "frames."))
         neighbors = Neighbors(
