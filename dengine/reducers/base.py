@@ -38,7 +38,7 @@ from torch import Tensor, nn
 from ..decision.classifier import classes_of
 from ..errors import SettingError, TraceError, expect, instead
 from ..folds import content_fold
-from ..records import Arrays, State
+from ..records import Arrays, State, is_whole
 
 Floats = NDArray[np.float32]
 Ints = NDArray[np.int64]
@@ -549,6 +549,16 @@ def draw_seed(random_state: Any) -> int:
     expected = "Expected random_state None, an integer or a RandomState"
     with instead(SettingError, expected, ValueError):
         return int(check_random_state(random_state).randint(2**31 - 1))
+
+
+def check_integers(reducer: Any, **ranges: tuple[int, int]) -> None:
+    """Raise SettingError unless each of these parameters is an integer in its range.
+
+    A range holds the smallest and the largest value.
+    """
+    for name, (least, most) in ranges.items():
+        value = getattr(reducer, name)
+        expect(is_whole(value, least, most), f"{name} from {least} to {most}, an integer", value)
 
 
 def uses_labels(transformer: Any) -> bool:

@@ -207,13 +207,13 @@ class ConvReducer(TorchReducer):
 
     def _initialize(self, traces: Floats) -> None:
         super()._initialize(traces)
-        self.rocket_.init_encoder(traces)
+        self.rocket_._initialize(traces)
 
     def _build(self, channels: int, samples: int, average: int, seed: int | None = None) -> None:
         """Build `rocket_`, preprocessor and networks for traces of this shape.
 
-        It does what `TorchReducer._build` does, after making `rocket_`, a `RocketReducer` whose
-        kernels and classifier heads are 0 as yet. The networks have initial weights. `average` is
+        It does what `TorchReducer._build` does, after making `rocket_`, a `RocketReducer` that is
+        not initialised yet. The networks have initial weights. `average` is
         the number of samples that are averaged to one. Without `seed` the seed of the networks
         comes from `random_state`. Raises SettingError as `TorchReducer._build` does.
         """
@@ -224,7 +224,6 @@ class ConvReducer(TorchReducer):
             max_iter=HEAD_STEPS,
             random_state=self.random_state,
         )
-        self.rocket_.build(channels, samples, average)
         super()._build(channels, samples, average, seed)
 
     def _train(

@@ -25,9 +25,8 @@ predictions on held-out rows. Chernozhukov et al. (2018), Double/debiased machin
 Econometrics Journal 21: cross-fitting.
 """
 
-import copy
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Self
+from typing import NamedTuple, Self
 
 import numpy as np
 import torch
@@ -37,13 +36,14 @@ from torch import Tensor, nn
 
 from ..decision.scripting import arrays_with_prefix, module_state, restore
 from ..errors import expect
-from ..records import Arrays, State, is_whole
+from ..records import Arrays, State
 from .base import (
     FitReport,
     Floats,
     Ints,
     StopRule,
     check_classes,
+    check_integers,
     draw_seed,
     embed_in_chunks,
     points_in_fold_space,
@@ -342,7 +342,7 @@ class RocketReducer(ProbabilityReducer):
     ) -> Floats:
         """Fit the classifier heads like `train`, but without checking the input.
 
-        Call `init_encoder` first: otherwise all kernels are 0, and the result is meaningless
+        Call `_initialize` first: otherwise all kernels are 0, and the result is meaningless
         without an error. Traces are (n, C, T), labels (n,) 1 or 0; they may be of one class. `stop`
         and `numbers`, those of the labels, which must increase, are as in `train`. `net_` is
         changed in place; `towers_` and what a fit reports (`n_iter_`, `holdout_losses_`)
@@ -371,16 +371,9 @@ class RocketReducer(ProbabilityReducer):
         No label is read. Earlier fits are discarded. Raises SettingError for a parameter out of its
         range or fewer than 2 samples.
         """
-        self.build(traces.shape[1], traces.shape[2], averaging(torch.from_numpy(traces)))
-        self.init_encoder(traces)
-
-    def init_encoder(self, traces: Floats) -> None:
-        """Set the channel scales, the random kernels and their thresholds from traces (n, C, T).
-
-        `build` must have been called. No label is read.
-        """
-        generator = np.random.default_rng(draw_seed(self.random_state))
-        self.net_.encoder.learn(torch.from_numpy(traces), generator)
+        x = torch.from_numpy(traces)
+        self.build(traces.shape[1], traces.shape[2], averaging(x))
+        self.net_.encoder.learn(x, np.random.default_rng(draw_seed(self.random_state)))
         self.is_initialized_ = True
 
     def build(self, channels: int, samples: int, average: int) -> None:
@@ -525,26 +518,27 @@ class RocketReducer(ProbabilityReducer):
         self.towers_.append(
             Tower.from_features(products, self.width, PRODUCT_VARIANCE, no_weights, no_logits)
         )
-        first = self.towers_[0]
-        columns = encoder.towers[0]
-        net.weight[columns, net.n_scores :] = first.axes[:, : net.n_leading]
-        net.bias[net.n_scores :] = first.centre[: net.n_leading]
-        if self.n_components == 2:
-            self._set_second_axis(f[:, columns], first.axes[:, 0])
+        self._set_axes(f[:, encoder.towers[0]])
 
-    def _set_second_axis(self, f: Tensor, axis: Tensor) -> None:
-        """Write the second coordinate of the embedding to `net_`: a sigmoid of a component.
+    def _set_axes(self, f: Tensor) -> None:
+        """Write the leading components of the first `Tower`, and the second coordinate, to `net_`.
 
-        `axis` (p,) is the axis of the component on the features `f` (n, p) of the first `Tower`.
-        Before the sigmoid the component is scaled to mean 0 and standard deviation 2 over `f`. Its
-        sign is changed if it would point against the second coordinate that `net_` had before.
+        If there is a second coordinate, it is a sigmoid of the first component. Before the sigmoid
+        the component is scaled to mean 0 and standard deviation 2 over the tower's features `f` (n,
+        p). Its sign is changed if it would point against the second coordinate that `net_` had
+        before.
         """
         net = self.net_
         columns = net.encoder.towers[0]
-        second = 2.0 * axis / (f @ axis).std().clamp(min=1e-12)
-        second = second if second @ net.weight[columns, 1] >= 0 else -second
-        net.weight[columns, 1 : net.n_scores : 2] = second[:, None]
-        net.bias[1 : net.n_scores : 2] = -(f.mean(0) @ second)
+        first = self.towers_[0]
+        net.weight[columns, net.n_scores :] = first.axes[:, : net.n_leading]
+        net.bias[net.n_scores :] = first.centre[: net.n_leading]
+        if self.n_components == 2:
+            axis = first.axes[:, 0]
+            second = 2.0 * axis / (f @ axis).std().clamp(min=1e-12)
+            second = second if second @ net.weight[columns, 1] >= 0 else -second
+            net.weight[columns, 1 : net.n_scores : 2] = second[:, None]
+            net.bias[1 : net.n_scores : 2] = -(f.mean(0) @ second)
 
     def raw_features(self, traces: Floats, numbers: Ints | None = None) -> Tensor:
         """Return the unscaled features (n, P) of traces (n, C, T), as a tensor.
@@ -569,16 +563,6 @@ class RocketReducer(ProbabilityReducer):
             self._raw = raw[positions[0] : positions[-1] + 1] if is_slice else raw[positions]
             self._numbers = numbers
         return torch.from_numpy(self._raw)
-
-    def __deepcopy__(self, memo: dict[int, Any]) -> Self:
-        """Copy the module, which a training changes in place, and share all else.
-
-        A training replaces all other attributes and changes none.
-        """
-        new = copy.copy(self)
-        if "net_" in vars(self):
-            new.net_ = copy.deepcopy(self.net_, memo)
-        return new
 
     @property
     def report(self) -> FitReport:
@@ -649,19 +633,22 @@ class RocketReducer(ProbabilityReducer):
     def check(self) -> None:
         """Raise SettingError for a parameter out of its range.
 
-        `kernels`, `dilations`, `width` and `max_iter` are integers of at least 1 and at most a
-        billion, `regions` is an integer from 1 to 16 and `groups` from 0 to 64, `n_components` is 1
-        or 2, and `folds` at least 2. `l2` is above 0.
+        All but `l2` are integers: `kernels`, `dilations`, `width` and `max_iter` from 1 to a
+        billion, `regions` from 1 to 16, `groups` from 0 to 64, `n_components` 1 or 2, and `folds`
+        from 2 to 1000. `l2` is above 0.
         """
-        integers = ("n_components", "folds", "max_iter", "kernels", "dilations", "regions", "width")
-        for name in integers:
-            value = getattr(self, name)
-            expect(is_whole(value, 1, MAX_INTEGER), f"{name} >= 1, an integer", value)
-        expect(self.regions <= 16, "regions <= 16", self.regions)
-        expect(is_whole(self.groups, 0, 64), "groups from 0 to 64, an integer", self.groups)
-        expect(self.n_components <= 2, "n_components 1 or 2", self.n_components)
+        check_integers(
+            self,
+            n_components=(1, 2),
+            folds=(2, 1000),
+            kernels=(1, MAX_INTEGER),
+            dilations=(1, MAX_INTEGER),
+            regions=(1, 16),
+            groups=(0, 64),
+            width=(1, MAX_INTEGER),
+            max_iter=(1, MAX_INTEGER),
+        )
         expect(self.l2 > 0, "l2 > 0, or separable labels have no solution", self.l2)
-        expect(self.folds >= 2, "folds >= 2 where labels are used", self.folds)
 
 
 def sample_rows(n: int, numbers: Ints | None) -> Ints:

@@ -24,7 +24,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache, lru_cache
 from os import PathLike
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 import torch
@@ -43,13 +43,14 @@ from ..decision.scripting import (
     script,
 )
 from ..errors import SettingError, counted, expect, log
-from ..records import Arrays, State, is_number, is_whole
+from ..records import Arrays, State, is_number
 from .base import (
     SAME_POINTS,
     FitReport,
     Floats,
     Ints,
     StopRule,
+    check_integers,
     draw_seed,
     embed_in_chunks,
 )
@@ -63,6 +64,7 @@ STATISTICS_TRACES = 256  # from which the statistics of batch normalisation are 
 STEPS_PER_LABEL = 1.2  # that training must have had before it is called complete,
 INITIAL_STEPS = 36  # on top of these
 MANY_LABELS = 4000  # labels beyond which embedding them leaves no time for more steps
+MAX_INTEGER = 10**6  # of a parameter
 CATCH_UP_FACTOR = 2  # times the steps of a retrain, as long as training is behind
 
 
@@ -373,14 +375,12 @@ class TorchReducer(ProbabilityReducer):
         step of the optimiser changes `optimizer_state_`. Weight decay is only for parameters of two
         dimensions or more whose name ends in "weight", so not for biases and batch normalisation.
         """
-        decayed: list[nn.Parameter] = []
-        others: list[nn.Parameter] = []
+        parameters: dict[bool, list[nn.Parameter]] = {True: [], False: []}  # by whether they decay
         for name, parameter in self.members_.named_parameters():
-            is_weight = parameter.dim() > 1 and name.endswith("weight")
-            (decayed if is_weight else others).append(parameter)
-        groups: list[dict[str, Any]] = [
-            {"params": decayed, "weight_decay": self.weight_decay},
-            {"params": others, "weight_decay": 0.0},
+            parameters[parameter.dim() > 1 and name.endswith("weight")].append(parameter)
+        groups = [
+            {"params": parameters[True], "weight_decay": self.weight_decay},
+            {"params": parameters[False], "weight_decay": 0.0},
         ]
         optimizer = torch.optim.AdamW(groups, lr=self.learning_rate, fused=True)
         if self.optimizer_state_:
@@ -570,12 +570,15 @@ class TorchReducer(ProbabilityReducer):
         learning_rate above 0, weight_averaging below 1, and no other number is negative or
         infinite. checkpoint is a text or path; no file is looked at.
         """
-        expect(self.n_components in (1, 2), "n_components 1 or 2", self.n_components)
-        smallest = {"folds": 2, "steps": 1, "fit_steps": 1, "batch_size": 2, "shift": 0}
-        for name, least in smallest.items():
-            value = getattr(self, name)
-            expect(is_whole(value, least, 10**6), f"{name} >= {least}, an integer", value)
-        expect(self.folds <= 1000, "folds <= 1000", self.folds)
+        check_integers(
+            self,
+            n_components=(1, 2),
+            folds=(2, 1000),
+            steps=(1, MAX_INTEGER),
+            fit_steps=(1, MAX_INTEGER),
+            batch_size=(2, MAX_INTEGER),
+            shift=(0, MAX_INTEGER),
+        )
         not_negative = "learning_rate", "weight_averaging", "weight_decay", "gain", "noise", "mixup"
         for name in not_negative:
             value = getattr(self, name)

@@ -44,6 +44,7 @@ from .base import (
     Reducer,
     StopRule,
     as_points,
+    check_integers,
     draw_seed,
     embed_in_chunks,
 )
@@ -468,13 +469,10 @@ class UmapReducer(Reducer):
         """Return the report of the last training: its epochs, and the epochs that are missing.
 
         A first layout, which starts from eigenvectors of the graph, takes 200 epochs (or
-        `n_epochs`), in one training or in several. The note says how many of them are missing; it
-        is "" if none is missing. Raises NotFittedError before a fit.
+        `n_epochs`), in one training or in several. Raises NotFittedError before a fit.
         """
         check_is_fitted(self, "encoder_")
-        left = self.n_steps_left_
-        note = f"{left} epochs of the first layout to go" if left else ""
-        return FitReport(self.n_new_steps_, note, left)
+        return FitReport(self.n_new_steps_, n_steps_left=self.n_steps_left_)
 
     def get_state(self) -> State:
         """Return arrays from which `set_state` restores the reducer bit for bit, by name.
@@ -523,8 +521,7 @@ class UmapReducer(Reducer):
         n_components must be an integer from 1 to 100, n_neighbors from 2 to 1000, and there must be
         more traces than either. min_dist is from 0 to 1, n_epochs an integer of at least 1 or None.
         """
-        expect(is_whole(self.n_components, 1, 100), "n_components from 1 to 100", self.n_components)
-        expect(is_whole(self.n_neighbors, 2, 1000), "n_neighbors from 2 to 1000", self.n_neighbors)
+        check_integers(self, n_components=(1, 100), n_neighbors=(2, 1000))
         is_distance = is_number(self.min_dist) and 0.0 <= self.min_dist <= 1.0
         expect(is_distance, "min_dist from 0 to 1", self.min_dist)
         epochs = self.n_epochs
