@@ -240,7 +240,7 @@ class ConvReducer(TorchReducer):
         `stop` is asked before the steps of both, and counts each from 0. `numbers` (n,) identify
         the traces, see `RocketReducer.train`. Returns the points of the traces, float32 (n, d),
         with averaged logits, row i in space ``folds[i]``. Sets what `TorchReducer._train` and
-        `RocketReducer._fit_heads` set; raises SettingError like the former, with `rocket_` trained
+        `RocketReducer.train_heads` set; raises SettingError like the former, with `rocket_` trained
         already.
         """
         probabilities = self.rocket_.train_heads(traces, labels, folds, stop, numbers)  # (n, 1)

@@ -302,7 +302,7 @@ class RocketReducer(ProbabilityReducer):
 
     def _fit(self, traces: Floats, labels: Ints, folds: Ints) -> None:
         check_classes(labels, self.training_masks(folds))
-        self._fit_heads(self.raw_features(traces), labels, folds, StopRule())
+        self.train_heads(traces, labels, folds, StopRule())
 
     def train(
         self,
@@ -342,16 +342,41 @@ class RocketReducer(ProbabilityReducer):
     ) -> Floats:
         """Fit the classifier heads like `train`, but without checking the input.
 
-        Call `_initialize` first: otherwise all kernels are 0, and the result is meaningless
-        without an error. Traces are (n, C, T), labels (n,) 1 or 0; they may be of one class. `stop`
-        and `numbers`, those of the labels, which must increase, are as in `train`. `net_` is
-        changed in place; `towers_` and what a fit reports (`n_iter_`, `holdout_losses_`)
-        are replaced, and with `numbers` the cache, which then has these traces alone. Returns the
-        points of the traces, float32 (n, d), row i in embedding space ``folds[i]``, whose head did
-        not see the label of row i.
+        Call `_initialize` first. Traces are (n, C, T), labels (n,) 1 or 0; they may be of one
+        class. `stop` and `numbers`, those of the labels, which must increase, are as in `train`.
+
+        Head k starts from its last weights, and is fitted on the rows outside fold k of at most
+        4000 rows (`sample_rows`). `stop` may end each tower's Newton steps; in the first fit its
+        deadline leaves three. Components are new at the first fit, after every 20, and for at least
+        1.5 times as many rows as the last ones. The heads of each `Tower` are written to `net_`,
+        weighed to one logit. `towers_` and what a fit reports (`n_iter_`, most steps of a tower,
+        and `holdout_losses_`) are replaced, `n_fits_` grows, and with `numbers` the cache then has
+        these traces alone. Returns the points of the traces, float32 (n, d), row i in embedding
+        space ``folds[i]``, whose head did not see the label of row i.
         """
         raw = self.raw_features(traces, numbers)
-        self._fit_heads(raw, labels, folds, stop, numbers)
+        with torch.no_grad():
+            grew = len(raw) >= GROWTH * self.n_component_traces_
+            if grew or self.n_fits_ % REFRESH_EVERY == 0:
+                self._compute_components(raw)
+            min_steps = 0 if self.n_fits_ else MIN_FIRST_STEPS
+            rows = sample_rows(len(raw), numbers)
+            f = self.net_.encoder.scale_features(raw[rows])
+            y = torch.from_numpy(labels[rows])
+            outside = torch.from_numpy(self.training_masks(folds[rows]))
+            fits = []
+            for tower, features in zip(self.towers_, self._tower_features(f), strict=True):
+                g = tower.components(features)
+                fit = fit_heads(g, y, outside, tower.w, self.l2, self.max_iter, stop, min_steps)
+                fits.append(fit)
+            pairs = zip(self.towers_, fits, strict=True)
+            self.towers_ = [tower._replace(w=fit.w) for tower, fit in pairs]
+            penalties = [0.0] * (len(fits) - 1) + [PRODUCT_PENALTY]
+            shares, losses = weigh_towers([fit.left_out for fit in fits], penalties, y, outside)
+            self._set_heads(shares)
+        self.n_iter_ = max(fit.n_steps for fit in fits)
+        self.holdout_losses_ = losses.numpy()
+        self.n_fits_ += 1
         return points_in_fold_space(embed_in_chunks(self._embed_raw, raw, 16 * CHUNK), folds)
 
     def precompute(self, X: Floats, numbers: Ints | None = None) -> None:
@@ -406,50 +431,6 @@ class RocketReducer(ProbabilityReducer):
         self._numbers = np.zeros(0, dtype=np.int64)  # labels whose features are cached
         # The features of these, (n, P): an array is pickled at less cost than a tensor.
         self._raw = np.empty((0, len(encoder.gain)), dtype=np.float32)
-
-    def _fit_heads(
-        self,
-        raw: Tensor,
-        labels: Ints,
-        folds: Ints,
-        stop: StopRule,
-        numbers: Ints | None = None,
-    ) -> None:
-        """Fit the classifier heads of each `Tower`, and write them to `net_`, weighed to one logit.
-
-        Head k starts from its last weights. It is fitted on the rows outside fold k of `raw` (n,
-        P), of at most 4000 (`sample_rows`). `labels` (n,) are 1 or 0; for `numbers` see `train`.
-        `stop` may end each tower's Newton steps; in the first fit its deadline leaves three.
-        Components are new at the first fit, after every 20, and for at least 1.5 times as many rows
-        as the last ones. Sets `towers_`, `n_iter_` (most steps of a tower), `holdout_losses_` and
-        `n_fits_`.
-        """
-        with torch.no_grad():
-            grew = len(raw) >= GROWTH * self.n_component_traces_
-            if grew or self.n_fits_ % REFRESH_EVERY == 0:
-                self._compute_components(raw)
-            min_steps = 0 if self.n_fits_ else MIN_FIRST_STEPS
-            if len(raw) > MAX_TRAINING_TRACES:
-                rows = sample_rows(len(raw), numbers)
-                raw = raw[rows]
-                labels = labels[rows]
-                folds = folds[rows]
-            f = self.net_.encoder.scale_features(raw)
-            y = torch.from_numpy(labels)
-            outside = torch.from_numpy(self.training_masks(folds))
-            fits = []
-            for tower, features in zip(self.towers_, self._tower_features(f), strict=True):
-                g = tower.components(features)
-                fit = fit_heads(g, y, outside, tower.w, self.l2, self.max_iter, stop, min_steps)
-                fits.append(fit)
-            pairs = zip(self.towers_, fits, strict=True)
-            self.towers_ = [tower._replace(w=fit.w) for tower, fit in pairs]
-            penalties = [0.0] * (len(fits) - 1) + [PRODUCT_PENALTY]
-            shares, losses = weigh_towers([fit.left_out for fit in fits], penalties, y, outside)
-            self._set_heads(shares)
-        self.n_iter_ = max(fit.n_steps for fit in fits)
-        self.holdout_losses_ = losses.numpy()
-        self.n_fits_ += 1
 
     def _set_heads(self, shares: list[Tensor]) -> None:
         """Write the classifier heads of `towers_` to `net_`, which then gives K logits.
@@ -651,13 +632,17 @@ class RocketReducer(ProbabilityReducer):
         expect(self.l2 > 0, "l2 > 0, or separable labels have no solution", self.l2)
 
 
-def sample_rows(n: int, numbers: Ints | None) -> Ints:
+def sample_rows(n: int, numbers: Ints | None) -> Ints | slice:
     """Draw `MAX_TRAINING_TRACES` of n rows, without reading labels; return them in order.
+
+    If there are no more rows than that, all are returned, as a slice.
 
     A hash of the labels' numbers (n,) draws them, evenly in time. So most rows are those of the
     last fit, and the heads start near their final weights. If `numbers` is None, they are 0 to
-    n - 1. n must be larger than `MAX_TRAINING_TRACES`.
+    n - 1.
     """
+    if n <= MAX_TRAINING_TRACES:
+        return slice(None)
     values = np.arange(n) if numbers is None else numbers
     hashes = values.astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15)
     return np.sort(np.argpartition(hashes, MAX_TRAINING_TRACES)[:MAX_TRAINING_TRACES])

@@ -261,8 +261,7 @@ class UmapReducer(Reducer):
             If X is not of one of these shapes or sparse, a value is not finite, or all samples are
             below 1e-12 but not all are 0 (`check_traces`).
         """
-        traces = self.check_traces(X, reset=True)
-        self.check(len(traces))
+        traces = self._check(X, reset=True)
         self._initialize(traces)
         self._train(traces, None, StopRule(), self._n_first_epochs)
         return self
@@ -286,8 +285,7 @@ class UmapReducer(Reducer):
         `embedding_`. Raises the errors of `check_traces`, and SettingError for a parameter out of
         its range, or too few traces.
         """
-        traces = self.check_traces(X, reset=not self._is_fitted)
-        self.check(len(traces))
+        traces = self._check(X, reset=not self._is_fitted)
         if numbers is None or not self._has_searched_any(numbers):
             self._initialize(traces)
         self._train(traces, numbers, stop or StopRule())
@@ -317,8 +315,7 @@ class UmapReducer(Reducer):
         """
         if numbers is None:
             return
-        traces = self.check_traces(X, reset=not self._is_fitted)
-        self.check(len(traces))
+        traces = self._check(X, reset=not self._is_fitted)
         if not self._is_fitted:
             self._initialize(traces)
         neighbors = self.neighbors_.update(traces, numbers, self.make_frames_)
@@ -515,18 +512,21 @@ class UmapReducer(Reducer):
         self._set_references(neighbors, torch.from_numpy(np.array(state["embedding"])))
         return self
 
-    def check(self, n_traces: int) -> None:
-        """Raise SettingError for a parameter out of its range, or too few traces.
+    def _check(self, X: ArrayLike, reset: bool) -> Floats:
+        """Check traces and parameters, and return the traces as `check_traces` does.
 
-        n_components must be an integer from 1 to 100, n_neighbors from 2 to 1000, and there must be
-        more traces than either. min_dist is from 0 to 1, n_epochs an integer of at least 1 or None.
+        Raises SettingError for a parameter out of its range, or too few traces. n_components must
+        be an integer from 1 to 100, n_neighbors from 2 to 1000, and there must be more traces than
+        either. min_dist is from 0 to 1, n_epochs an integer of at least 1 or None.
         """
+        traces = self.check_traces(X, reset=reset)
         check_integers(self, n_components=(1, 100), n_neighbors=(2, 1000))
         is_distance = is_number(self.min_dist) and 0.0 <= self.min_dist <= 1.0
         expect(is_distance, "min_dist from 0 to 1", self.min_dist)
         epochs = self.n_epochs
         expect(epochs is None or is_whole(epochs, 1, 10**6), "n_epochs of 1 or more", epochs)
         smallest = max(self.n_neighbors, self.n_components)
-        if n_traces <= smallest:
-            actual = f"n_samples = {n_traces}"
+        if len(traces) <= smallest:
+            actual = f"n_samples = {len(traces)}"
             raise SettingError(f"UMAP needs more than {smallest} traces, got {actual}.")
+        return traces
