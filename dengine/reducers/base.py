@@ -353,10 +353,11 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
                 "Expected traces (n, samples) or (n, channels, samples) with samples, "
                 f"got shape {x.shape}."
             )
-        traces = x[:, None, :] if x.ndim == 2 else x
-        if reset or x.ndim == 2:  # only a table's columns have names and a number to compare
+        is_table = x.ndim == 2
+        traces = x[:, None, :] if is_table else x
+        if reset or is_table:  # only a table's columns have names and a number to compare
             validate_data(
-                self, X if x.ndim == 2 else as_rows(traces), reset=reset, skip_check_array=True
+                self, X if is_table else as_rows(traces), reset=reset, skip_check_array=True
             )
         if reset:
             largest = float(max(traces.max(), -traces.min()))

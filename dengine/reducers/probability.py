@@ -5,16 +5,14 @@ model, and copy k is trained without the labels of fold k.
 
 from abc import abstractmethod
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Self
+from typing import Any, Self
 
 from numpy.typing import ArrayLike
 from sklearn.base import clone
+from torch import nn
 
 from ..errors import expect
 from .base import Floats, Ints, Reducer, binary_labels, folds_of
-
-if TYPE_CHECKING:
-    from torch import nn
 
 MIN_TRACES = 20  # of the first training
 
@@ -91,7 +89,7 @@ class ProbabilityReducer(Reducer):
         self._fit(traces, labels, folds)
         return self
 
-    def untrained_module(self, X: Floats) -> "nn.Module | None":
+    def untrained_module(self, X: Floats) -> nn.Module | None:
         """Return a module that can be compiled before the training on traces X (n, C, T).
 
         It is `module()` if the reducer is initialised. Otherwise it is the module of a clone that
@@ -100,10 +98,9 @@ class ProbabilityReducer(Reducer):
         """
         if self.is_initialized_:
             return self.module()
-        untrained = clone(self)
+        untrained: Self = clone(self)
         untrained._initialize(untrained.check_traces(X, reset=True))
-        module: nn.Module | None = untrained.module()
-        return module
+        return untrained.module()
 
     def _check_and_initialize(self, X: Floats) -> Floats:
         """Check traces and return them as (n, C, T); initialise the model at the first call.

@@ -332,6 +332,48 @@ class RocketReducer(ProbabilityReducer):
         check_classes(y, self.training_masks(folds))
         return self.train_heads(traces, y, folds, stop or StopRule(), numbers)
 
+    def _initialize(self, traces: Floats) -> None:
+        """Build the module `net_`, with channel scales and kernels from traces (n, C, T).
+
+        No label is read. Earlier fits are discarded. Raises SettingError for a parameter out of its
+        range or fewer than 2 samples.
+        """
+        x = torch.from_numpy(traces)
+        self.build(traces.shape[1], traces.shape[2], averaging(x))
+        self.net_.encoder.learn(x, np.random.default_rng(draw_seed(self.random_state)))
+        self.is_initialized_ = True
+
+    def build(self, channels: int, samples: int, average: int) -> None:
+        """Make the module `net_` for traces of this shape, with kernels and classifier heads of 0.
+
+        `towers_` and the cache of features become empty, `n_fits_` and `n_component_traces_` 0;
+        what a fit reports (`n_iter_`, `holdout_losses_`) stays. `average` is the number of
+        samples that are averaged to one. Raises SettingError for a parameter out of its range or
+        fewer than 2 samples.
+        """
+        self.check()
+        self.trace_shape_ = (channels, samples)
+        self.n_features_in_ = channels * samples
+        self.average_ = average
+        encoder = RocketEncoder(
+            channels,
+            samples,
+            average,
+            self.kernels,
+            self.dilations,
+            self.regions,
+            self.groups,
+        )
+        n_leading = min(N_LEADING, self.width, encoder.towers[0].stop)
+        self.net_ = FeatureEmbedding(encoder, self.folds, self.n_components, n_leading).eval()
+        self.is_initialized_ = False  # until kernels are drawn or restored
+        self.n_fits_ = 0
+        self.n_component_traces_ = 0
+        self.towers_: list[Tower] = []
+        self._numbers = np.zeros(0, dtype=np.int64)  # labels whose features are cached
+        # The features of these, (n, P): an array is pickled at less cost than a tensor.
+        self._raw = np.empty((0, len(encoder.gain)), dtype=np.float32)
+
     def train_heads(
         self,
         traces: Floats,
@@ -389,48 +431,6 @@ class RocketReducer(ProbabilityReducer):
         """
         if len(X) >= MIN_TRACES:
             self.raw_features(self._check_and_initialize(X), numbers)
-
-    def _initialize(self, traces: Floats) -> None:
-        """Build the module `net_`, with channel scales and kernels from traces (n, C, T).
-
-        No label is read. Earlier fits are discarded. Raises SettingError for a parameter out of its
-        range or fewer than 2 samples.
-        """
-        x = torch.from_numpy(traces)
-        self.build(traces.shape[1], traces.shape[2], averaging(x))
-        self.net_.encoder.learn(x, np.random.default_rng(draw_seed(self.random_state)))
-        self.is_initialized_ = True
-
-    def build(self, channels: int, samples: int, average: int) -> None:
-        """Make the module `net_` for traces of this shape, with kernels and classifier heads of 0.
-
-        `towers_` and the cache of features become empty, `n_fits_` and `n_component_traces_` 0;
-        what a fit reports (`n_iter_`, `holdout_losses_`) stays. `average` is the number of
-        samples that are averaged to one. Raises SettingError for a parameter out of its range or
-        fewer than 2 samples.
-        """
-        self.check()
-        self.trace_shape_ = (channels, samples)
-        self.n_features_in_ = channels * samples
-        self.average_ = average
-        encoder = RocketEncoder(
-            channels,
-            samples,
-            average,
-            self.kernels,
-            self.dilations,
-            self.regions,
-            self.groups,
-        )
-        n_leading = min(N_LEADING, self.width, encoder.towers[0].stop)
-        self.net_ = FeatureEmbedding(encoder, self.folds, self.n_components, n_leading).eval()
-        self.is_initialized_ = False  # until kernels are drawn or restored
-        self.n_fits_ = 0
-        self.n_component_traces_ = 0
-        self.towers_: list[Tower] = []
-        self._numbers = np.zeros(0, dtype=np.int64)  # labels whose features are cached
-        # The features of these, (n, P): an array is pickled at less cost than a tensor.
-        self._raw = np.empty((0, len(encoder.gain)), dtype=np.float32)
 
     def _set_heads(self, shares: list[Tensor]) -> None:
         """Write the classifier heads of `towers_` to `net_`, which then gives K logits.
