@@ -129,7 +129,7 @@ def test_a_head_that_would_do_worse_than_the_base_rate_predicts_it_and_the_other
     # Head 1 learns from forty rows, head 0 from enough.
     outside = torch.arange(940) < torch.tensor([[900], [40]])
     start = torch.zeros(2, 51, dtype=torch.float64)
-    w, *_ = fit_heads(g, y, outside, start, 0.01, 30, StopRule())
+    w = fit_heads(g, y, outside, start, 0.01, 30, StopRule()).w
     assert w[:, :-1].any(1).tolist() == [True, False]
     assert torch.sigmoid(w[1, -1]) == pytest.approx(float(y[:40].double().mean()))
 
@@ -137,7 +137,7 @@ def test_a_head_that_would_do_worse_than_the_base_rate_predicts_it_and_the_other
 def test_heads_end_where_scikit_learns_logistic_regression_does():
     g, y = problem(400, 12)
     outside = torch.arange(400) % 3 != torch.arange(3)[:, None]
-    w, *_ = fit_heads(g, y, outside, torch.zeros(3, 13).double(), 1.0, 30, StopRule())
+    w = fit_heads(g, y, outside, torch.zeros(3, 13).double(), 1.0, 30, StopRule()).w
     for k in range(3):
         theirs = LogisticRegression(C=1.0, tol=1e-8).fit(g[outside[k]], y[outside[k]])
         np.testing.assert_allclose(w[k, :-1], theirs.coef_[0], atol=2e-3)
