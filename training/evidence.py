@@ -92,7 +92,6 @@ class DishonestReducer(ConvReducer):
     def _build(self, channels: int, samples: int, average: int, seed: int | None = None) -> None:
         super()._build(channels, samples, average, seed)
         self.rocket_ = DishonestRocket(**self.rocket_.get_params())
-        self.rocket_.build(channels, samples, average)
 
     def fit_loop(
         self, x: torch.Tensor, y: torch.Tensor, folds: np.ndarray, stop: StopRule, steps: int

@@ -13,7 +13,6 @@ from inspect import signature
 from typing import TYPE_CHECKING, Any
 
 import lazy_loader
-import numpy as np
 
 from ..errors import SettingError, expect
 from ..imports import import_class
@@ -117,12 +116,11 @@ def _check_parameter(default: Any, key: str, value: Any) -> None:
 
     The value must have the type of `default`; if that is a float, any number but NaN will do.
     `folds` must lie between 2 and 1000, any other integer within 32 bits. If the default is
-    neither bool, str, int nor float, as None is, the value is not checked. Without the check, a
+    neither str, int nor float, as None is, the value is not checked. Without the check, a
     wrong value would make every retrain fail.
     """
     integers = (2, 1000) if key == "folds" else (-MAX_INTEGER, MAX_INTEGER)
     checks = {
-        bool: ("true or false", isinstance(value, bool | np.bool_)),
         str: ("a text", isinstance(value, str)),
         int: ("an integer", is_whole(value, *integers)),
         float: ("a number", is_number(value) and value == value),  # no NaN

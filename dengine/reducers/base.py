@@ -19,12 +19,13 @@ import time
 from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Self
+from typing import Any, Self
 
 import numpy as np
+import torch
 from numpy.typing import ArrayLike, NDArray
 from sklearn.base import BaseEstimator, ClassNamePrefixFeaturesOutMixin, TransformerMixin, clone
-from sklearn.utils import ClassifierTags, get_tags
+from sklearn.utils import ClassifierTags, check_random_state, get_tags
 from sklearn.utils.validation import (
     assert_all_finite,
     check_array,
@@ -32,14 +33,12 @@ from sklearn.utils.validation import (
     column_or_1d,
     validate_data,
 )
+from torch import Tensor, nn
 
 from ..decision.classifier import classes_of
-from ..errors import SettingError, TraceError, expect
+from ..errors import SettingError, TraceError, expect, instead
 from ..folds import content_fold
-from ..records import Arrays, State
-
-if TYPE_CHECKING:
-    from torch import nn
+from ..records import Arrays, State, is_whole
 
 Floats = NDArray[np.float32]
 Ints = NDArray[np.int64]
@@ -234,7 +233,7 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
 
         Its attribute `dim` is the number of coordinates. None, the default, if the module is not
         known before training. The engine compiles this module ahead of the first training, which
-        then has less to do. Random kernels or weights may be drawn here.
+        then has less to do.
         """
 
     def warm_up(self) -> None:  # a default: nothing to load
@@ -265,7 +264,7 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
         """
         return points_in_fold_space(self.embed(X), folds)
 
-    def module(self) -> "nn.Module | None":
+    def module(self) -> nn.Module | None:
         """Return the embedding as a module that TorchScript can compile, (B, C, T) -> (B, K, d).
 
         None, the default, if the reducer has no module: it embeds in Python and cannot be exported.
@@ -336,11 +335,17 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
         """
         if not reset:
             check_is_fitted(self)
-        options = {"ensure_min_samples": int(reset), "estimator": self, "input_name": "X"}
         # Writeable, since torch warns of an array that it could not write to.
         x = np.asarray(
             check_array(
-                X, dtype=np.float32, order="C", allow_nd=True, force_writeable=True, **options
+                X,
+                dtype=np.float32,
+                order="C",
+                allow_nd=True,
+                force_writeable=True,
+                ensure_min_samples=int(reset),
+                estimator=self,
+                input_name="X",
             )
         )
         if x.ndim > 3 or 0 in x.shape[1:]:
@@ -348,10 +353,11 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
                 "Expected traces (n, samples) or (n, channels, samples) with samples, "
                 f"got shape {x.shape}."
             )
-        traces = x[:, None, :] if x.ndim == 2 else x
-        if reset or x.ndim == 2:  # only a table's columns have names and a number to compare
+        is_table = x.ndim == 2
+        traces = x[:, None, :] if is_table else x
+        if reset or is_table:  # only a table's columns have names and a number to compare
             validate_data(
-                self, X if x.ndim == 2 else as_rows(traces), reset=reset, skip_check_array=True
+                self, X if is_table else as_rows(traces), reset=reset, skip_check_array=True
             )
         if reset:
             largest = float(max(traces.max(), -traces.min()))
@@ -370,7 +376,7 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
     @property
     def _n_features_out(self) -> int:  # scikit-learn's name, for get_feature_names_out
         check_is_fitted(self)
-        return int(self.get_params(deep=False)["n_components"])
+        return int(self.transform(np.zeros((1, *self.trace_shape_))).shape[1])
 
     def __sklearn_tags__(self) -> Any:
         """Return scikit-learn's tags: labels of two classes are needed if `uses_labels`."""
@@ -393,6 +399,12 @@ def as_rows(traces: Floats) -> Floats:
     """Flatten traces (n, C, T) to (n, C * T), a view if they are contiguous; n may be 0."""
     n, channels, samples = traces.shape
     return traces.reshape(n, channels * samples)
+
+
+@torch.inference_mode()
+def embed_in_chunks(module: Callable[[Tensor], Tensor], x: Tensor, size: int) -> Floats:
+    """Embed the rows of x (n, ...) by a module, `size` rows at a time: float32 (n, K, d)."""
+    return torch.cat([module(chunk) for chunk in torch.split(x, size)]).numpy()
 
 
 def points_in_fold_space(Z: Floats, folds: Ints) -> Floats:
@@ -527,27 +539,27 @@ def check_classes(labels: Ints, masks: NDArray[np.bool_]) -> None:
             raise SettingError(f"Expected both classes outside fold {fold}, got {problem}.")
 
 
-def seed_of(random_state: Any) -> int | None:
-    """Return scikit-learn's `random_state` as a seed for NumPy and torch; None for None.
+def draw_seed(random_state: Any) -> int:
+    """Return a seed for NumPy and torch from scikit-learn's `random_state`.
 
-    A RandomState draws the seed, so it gives another one at each call. Raises SettingError unless
-    `random_state` is None, an integer or a RandomState.
+    An integer is the seed itself. A RandomState draws the seed, so it gives another one at each
+    call; None stands for NumPy's global generator. Raises SettingError for anything else.
     """
-    if random_state is None:
-        return None
     if isinstance(random_state, int | np.integer):
         return int(random_state)
-    if isinstance(random_state, np.random.RandomState):
-        return int(random_state.randint(2**31 - 1))
-    raise SettingError(
-        f"Expected random_state None, an integer or a RandomState, got {random_state!r}."
-    )
+    expected = "Expected random_state None, an integer or a RandomState"
+    with instead(SettingError, expected, ValueError):
+        return int(check_random_state(random_state).randint(2**31 - 1))
 
 
-def draw_seed(random_state: Any) -> int:
-    """Return the seed of a `random_state`, see `seed_of`; for None, return a random seed."""
-    seed = seed_of(random_state)
-    return int(np.random.default_rng().integers(2**31)) if seed is None else seed
+def check_integers(reducer: Any, **ranges: tuple[int, int]) -> None:
+    """Raise SettingError unless each of these parameters is an integer in its range.
+
+    A range holds the smallest and the largest value.
+    """
+    for name, (least, most) in ranges.items():
+        value = getattr(reducer, name)
+        expect(is_whole(value, least, most), f"{name} from {least} to {most}, an integer", value)
 
 
 def uses_labels(transformer: Any) -> bool:
@@ -580,7 +592,7 @@ class _Wrapping(Reducer):
     @property
     def own_unit(self) -> bool:  # type: ignore[override]  # elsewhere a constant of the class
         """Return `own_unit` of the wrapped `Reducer`; False for another transformer."""
-        return self.reducer.own_unit if isinstance(self.reducer, Reducer) else False
+        return bool(getattr(self.reducer, "own_unit", False))
 
     def as_input(self, X: Floats) -> Any:
         """Return traces (n, C, T) as the wrapped transformer takes them.
@@ -589,11 +601,6 @@ class _Wrapping(Reducer):
         that it may change.
         """
         return X if isinstance(self.reducer, Reducer) else as_rows(X).copy()
-
-    @property
-    def _n_features_out(self) -> int:
-        check_is_fitted(self)
-        return int(self.dim_)
 
 
 class LabelFree(_Wrapping):
@@ -609,12 +616,11 @@ class LabelFree(_Wrapping):
         """Fit a clone of the transformer, `reducer_`, on traces X; labels are ignored.
 
         X has the shape (n, T) or (n, C, T); a transformer that is no Reducer gets it as rows
-        (n, C * T). Returns self. `dim_` becomes the number of coordinates; `trace_shape_` and
-        `n_features_in_` are set, too. Raises what `check_traces` and the transformer raise.
+        (n, C * T). Returns self. `trace_shape_` and `n_features_in_` are set, too. Raises what
+        `check_traces` and the transformer raise.
         """
         traces = self.check_traces(X, reset=True)
         self.reducer_ = clone(self.reducer).fit(self.as_input(traces))
-        self.dim_ = as_points(self.reducer_.transform(self.as_input(traces[:1]))).shape[1]
         return self
 
     def transform(self, X: ArrayLike) -> Floats:
@@ -643,7 +649,7 @@ class CrossFitted(_Wrapping):
         return int(self.folds)
 
     def fit(self, X: ArrayLike, y: ArrayLike | None = None, *, folds: Ints | None = None) -> Self:
-        """Fit clone k on the traces outside fold k, for every k, and replace `clones_` and `dim_`.
+        """Fit clone k on the traces outside fold k, for every k, and replace `clones_`.
 
         `trace_shape_` and `n_features_in_` are set, too. If a fit raises, `clones_` may already
         hold clones that are not fitted.
@@ -654,7 +660,7 @@ class CrossFitted(_Wrapping):
         y : array, shape (n,)
             Labels of two classes; the clones get 1 for the one that sorts last, else 0.
         folds : array of int64, shape (n,), optional
-            Fold of each trace, 0 to K - 1; it is not checked. None: by a hash of its content.
+            Fold of each trace, 0 to K - 1. None: by a hash of its content.
 
         Returns
         -------
@@ -663,8 +669,8 @@ class CrossFitted(_Wrapping):
         Raises
         ------
         SettingError
-            If K is below 2, the labels are missing or not of two classes, or the traces outside a
-            fold have a single class.
+            If K is below 2, the labels are missing or not of two classes, folds do not fit the
+            traces, or the traces outside a fold have a single class.
         TraceError, ValueError, TypeError
             If X is not of one of these shapes or sparse, a value is not finite, or all samples are
             below 1e-12 but not all are 0 (`check_traces`). Errors of the clones are raised as they
@@ -673,14 +679,13 @@ class CrossFitted(_Wrapping):
         expect(self.folds >= 2, "folds >= 2 for a reducer that uses labels", self.folds)
         traces = self.check_traces(X, reset=True)
         labels = binary_labels(y, len(traces), type(self.reducer).__name__)
-        folds = content_fold(traces, self.folds) if folds is None else folds
+        folds = folds_of(traces, self.folds, folds)
         self.clones_ = [clone(self.reducer) for _ in range(self.folds)]
         masks = folds != np.arange(self.folds)[:, None]
         check_classes(labels, masks)
         # Clone k never sees the labels of fold k: they are counted in its space.
         for fitted, outside in zip(self.clones_, masks, strict=True):
             fitted.fit(self.as_input(traces[outside]), labels[outside])
-        self.dim_ = self.embed(traces[:1]).shape[2]
         return self
 
     def train(self, X: Floats, y: Ints, folds: Ints, *_: object, **__: object) -> Floats:

@@ -69,15 +69,13 @@ class ConvNetwork(nn.Module):
         signals = channels // 2
         width = max(width // 3, min(width, 2 * width // signals))
         groups = members * signals  # a convolution sees one signal; the hidden layer sees all
-        strides = (4 if samples >= MIN_SAMPLES_OF_STRIDE_4 else 2, 2, 2)
+        stride = 4 if samples >= MIN_SAMPLES_OF_STRIDE_4 else 2
         self.convolutions = FoldableSequential(
-            *conv_layers(groups, 2, width, kernel=15, stride=strides[0]),
-            *conv_layers(groups, width, 2 * width, kernel=9, stride=strides[1]),
-            *conv_layers(groups, 2 * width, 2 * width, kernel=9, stride=strides[2]),
+            *conv_layers(groups, 2, width, kernel=15, stride=stride),
+            *conv_layers(groups, width, 2 * width, kernel=9, stride=2),
+            *conv_layers(groups, 2 * width, 2 * width, kernel=9, stride=2),
         )
-        positions = samples  # P, after the last convolution
-        for stride in strides:
-            positions = (positions - 1) // stride + 1
+        positions = -(-samples // (stride * 2 * 2))  # P, after the last convolution
         regions = min(N_REGIONS, positions)
         self.stride = positions // regions
         self.window = positions - (regions - 1) * self.stride  # so that regions cover the trace
@@ -205,17 +203,17 @@ class ConvReducer(TorchReducer):
         """
         if len(X) >= self.min_traces:
             traces = self._check_and_initialize(X)
-            self.rocket_.precompute(traces, numbers)
+            self.rocket_.raw_features(traces, numbers)
 
     def _initialize(self, traces: Floats) -> None:
         super()._initialize(traces)
-        self.rocket_.init_encoder(traces)
+        self.rocket_._initialize(traces)
 
     def _build(self, channels: int, samples: int, average: int, seed: int | None = None) -> None:
         """Build `rocket_`, preprocessor and networks for traces of this shape.
 
-        It does what `TorchReducer._build` does, after making `rocket_`, a `RocketReducer` whose
-        kernels and classifier heads are 0 as yet. The networks have initial weights. `average` is
+        It does what `TorchReducer._build` does, after making `rocket_`, a `RocketReducer` that is
+        not initialised yet. The networks have initial weights. `average` is
         the number of samples that are averaged to one. Without `seed` the seed of the networks
         comes from `random_state`. Raises SettingError as `TorchReducer._build` does.
         """
@@ -226,7 +224,6 @@ class ConvReducer(TorchReducer):
             max_iter=HEAD_STEPS,
             random_state=self.random_state,
         )
-        self.rocket_.build(channels, samples, average)
         super()._build(channels, samples, average, seed)
 
     def _train(
@@ -243,7 +240,7 @@ class ConvReducer(TorchReducer):
         `stop` is asked before the steps of both, and counts each from 0. `numbers` (n,) identify
         the traces, see `RocketReducer.train`. Returns the points of the traces, float32 (n, d),
         with averaged logits, row i in space ``folds[i]``. Sets what `TorchReducer._train` and
-        `RocketReducer._fit_heads` set; raises SettingError like the former, with `rocket_` trained
+        `RocketReducer.train_heads` set; raises SettingError like the former, with `rocket_` trained
         already.
         """
         probabilities = self.rocket_.train_heads(traces, labels, folds, stop, numbers)  # (n, 1)
@@ -255,9 +252,8 @@ class ConvReducer(TorchReducer):
 
         The logit of the first coordinate is the mean of those of the network and of `rocket_`.
         """
-        traces = self.check_traces(X)
-        points = torch.from_numpy(super().embed(traces))
-        return average_logits(points, torch.from_numpy(self.rocket_.embed(traces))).numpy()
+        points = torch.from_numpy(super().embed(X))
+        return average_logits(points, torch.from_numpy(self.rocket_.embed(X))).numpy()
 
     def module(self) -> ConvEncoder:
         check_is_fitted(self, "encoder_")

@@ -110,7 +110,7 @@ class Grouped(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         features: Tensor = self.network(x.flatten(1, 2))
-        return features.view(x.size(0), self.count, -1)
+        return features.view(x.size(0), self.count, features.size(1) // self.count)
 
 
 class Separate(nn.Module):

@@ -32,16 +32,13 @@ class HeadsFit(NamedTuple):
         Weights, the bias last.
     left_out : Tensor of float64, shape (K, n)
         Leave-one-out logit of each row by each head, of use only if the row trains the head; the
-        logit of the base rate for heads in `at_base_rate`.
-    at_base_rate : list of int
-        Heads that predict their base rate.
+        logit of the base rate for a head that was replaced by it.
     n_steps : int
         Newton steps that were taken.
     """
 
     w: Tensor
     left_out: Tensor
-    at_base_rate: list[int]
     n_steps: int
 
 
@@ -83,7 +80,7 @@ class RidgeProblem:
     def objective(self, w: Tensor) -> Tensor:
         """Compute the sum of log losses plus the ridge of heads (K, W + 1): (K,)."""
         logits = w @ self.g.T
-        losses = (self.mask * (F.softplus(logits) - self.y * logits)).sum(1)
+        losses = summed_loss(logits, self.y, self.mask)
         return losses + 0.5 * (self.ridge * w * w).sum(1)
 
     def gradient(self, w: Tensor, p: Tensor) -> Tensor:
@@ -110,7 +107,7 @@ def fit_heads(
     w: Tensor,
     l2: float,
     max_iter: int,
-    stop: StopRule | None,
+    stop: StopRule,
     min_steps: int = 0,
 ) -> HeadsFit:
     """Fit K classifier heads, ridge logistic regressions, by Newton's method with a line search.
@@ -139,16 +136,16 @@ def fit_heads(
         Ridge.
     max_iter : int
         Largest number of steps.
-    stop : StopRule, optional
-        Asked before each step, which all heads take together. None: the steps go on until all heads
-        have converged, or `max_iter`.
+    stop : StopRule
+        Asked before each step, which all heads take together. The steps also end when all heads
+        have converged, or after `max_iter`.
     min_steps : int, default 0
         Number of first steps that the deadline of `stop` does not prevent.
 
     Returns
     -------
     HeadsFit
-        Weights, leave-one-out logits, heads that were replaced by the base rate, number of steps.
+        Weights, leave-one-out logits, number of steps.
     """
     problem = RidgeProblem.from_features(g, y, outside, l2)
     # Every head takes part in every product, whether it has converged or not: a product of another
@@ -157,19 +154,19 @@ def fit_heads(
     converged = torch.zeros(len(w), dtype=torch.bool)
     loss = problem.objective(w)
     step = 0
-    factors = [
-        problem.cholesky_of_hessian(k, torch.sigmoid(w[k] @ problem.g.T)) for k in range(len(w))
-    ]
+    factors = torch.stack(
+        [problem.cholesky_of_hessian(k, torch.sigmoid(w[k] @ problem.g.T)) for k in range(len(w))]
+    )
     stale = converged
     last_size = torch.ones(len(w), dtype=torch.float64)
     while step < max_iter and not converged.all():
-        if stop is not None and stop.exhausted(step, min_steps):
+        if stop.exhausted(step, min_steps):
             break
         p = torch.sigmoid(w @ problem.g.T)
         for k in stale.nonzero().flatten().tolist():
             factors[k] = problem.cholesky_of_hessian(k, p[k])
         gradient = problem.gradient(w, p)
-        change = torch.cholesky_solve(gradient[..., None], torch.stack(factors))[..., 0]
+        change = torch.cholesky_solve(gradient[..., None], factors)[..., 0]
         change[converged] = 0.0
         for _ in range(HALVINGS):
             new_loss = problem.objective(w - change)
@@ -188,13 +185,13 @@ def fit_heads(
         # A step with an old factor costs a tenth: a new one only where the old one is of no use.
         stale = ~converged & (rises | (size > (last_size / 4.0).clamp(max=0.3)))
         last_size = size
-    left_out = leave_one_out(problem, w @ problem.g.T, torch.stack(factors))
+    left_out = leave_one_out(problem, w @ problem.g.T, factors)
     return HeadsFit(*base_rate_if_better(w, left_out, problem.y, problem.mask), step)
 
 
 def base_rate_if_better(
     w: Tensor, left_out: Tensor, y: Tensor, mask: Tensor
-) -> tuple[Tensor, Tensor, list[int]]:
+) -> tuple[Tensor, Tensor]:
     """Replace each classifier head that does worse than its base rate by the base rate.
 
     The base rate is the share of successes among all rows that train the head. A head does worse if
@@ -217,16 +214,13 @@ def base_rate_if_better(
     w, left_out : Tensor
         New tensors like the arguments. For a head that was replaced, all weights but the bias are
         0, and its row of `left_out` is the logit of the base rate.
-    at_base_rate : list of int
-        The heads that were replaced.
     """
     rate = torch.logit((mask @ y) / mask.sum(1))[:, None].expand_as(left_out)
     # Of rows of one class, the rate has an infinite logit and a loss of NaN: the head stays.
     worse = masked_loss(left_out, y, mask) > masked_loss(rate, y, mask)
     w = torch.where(worse[:, None], 0.0, w)
     w[worse, -1] = rate[worse, 0]
-    left_out = torch.where(worse[:, None], rate, left_out)
-    return w, left_out, worse.nonzero().flatten().tolist()
+    return w, torch.where(worse[:, None], rate, left_out)
 
 
 def leave_one_out(problem: RidgeProblem, logits: Tensor, factors: Tensor) -> Tensor:
@@ -264,4 +258,9 @@ def masked_loss(logits: Tensor, y: Tensor, mask: Tensor) -> Tensor:
     logits (..., K, n), labels y (n,), mask (K, n) of 1 and 0. Returns (..., K), NaN for a mask
     that selects no row.
     """
-    return (mask * (F.softplus(logits) - y * logits)).sum(-1) / mask.sum(1)
+    return summed_loss(logits, y, mask) / mask.sum(1)
+
+
+def summed_loss(logits: Tensor, y: Tensor, mask: Tensor) -> Tensor:
+    """Sum log losses over the rows that each mask selects; arguments as in `masked_loss`."""
+    return (mask * (F.softplus(logits) - y * logits)).sum(-1)

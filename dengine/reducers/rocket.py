@@ -25,38 +25,34 @@ predictions on held-out rows. Chernozhukov et al. (2018), Double/debiased machin
 Econometrics Journal 21: cross-fitting.
 """
 
-import copy
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Self
+from typing import NamedTuple, Self
 
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
-from sklearn.base import clone
 from sklearn.utils.validation import check_is_fitted
 from torch import Tensor, nn
 
 from ..decision.scripting import arrays_with_prefix, module_state, restore
 from ..errors import expect
-from ..records import Arrays, State, is_whole
+from ..records import Arrays, State
 from .base import (
     FitReport,
     Floats,
     Ints,
-    Reducer,
     StopRule,
-    binary_labels,
     check_classes,
-    folds_of,
+    check_integers,
+    draw_seed,
+    embed_in_chunks,
     points_in_fold_space,
-    seed_of,
 )
 from .logistic_heads import fit_heads, masked_loss
 from .preprocessing import averaging
+from .probability import MIN_TRACES, ProbabilityReducer
 from .rocket_features import CHUNK, RocketEncoder, compute_raw_features
 
-MIN_TRACES = 20  # of the first training
 MIN_FIRST_STEPS = 3  # of the first heads, even after the deadline; without any they tell nothing
 MAX_TRAINING_TRACES = 4000  # to which heads are fitted, which bounds the time of a training
 GROWTH = 1.5  # times as many traces, after which components are computed anew,
@@ -255,11 +251,12 @@ def weigh_towers(
 
 
 @dataclass(eq=False, repr=False, kw_only=True)
-class RocketReducer(Reducer):
+class RocketReducer(ProbabilityReducer):
     """Embed traces by random convolution kernels and cross-fitted classifier heads.
 
     The first axis of the embedding is the predicted probability of success. The second spreads the
-    points in pictures; it is small against the radius.
+    points in pictures; it is small against the radius. Of more than 4000 traces, the heads are
+    fitted to 4000.
 
     Parameters
     ----------
@@ -286,8 +283,6 @@ class RocketReducer(Reducer):
         Steps of the last fit.
     holdout_losses_ : array of float64, shape (K,)
         Leave-one-out log loss of the logit of each space, over the rows outside its fold.
-    note_ : str
-        One line for the operator.
 
     Examples
     --------
@@ -297,14 +292,6 @@ class RocketReducer(Reducer):
     (60, 2, 2)
     """
 
-    uses_labels = True
-    scores = True
-    min_traces = MIN_TRACES
-    own_unit = True
-    default_radius = 0.07  # of a probability: seven in a hundred, never rescaled
-
-    n_components: int = 2
-    folds: int = 5
     kernels: int = 28
     dilations: int = 5
     regions: int = 3
@@ -312,47 +299,10 @@ class RocketReducer(Reducer):
     width: int = 128
     l2: float = 0.5
     max_iter: int = 20
-    random_state: Any = 0
 
-    @property
-    def n_spaces(self) -> int:
-        return int(self.folds)
-
-    def fit(self, X: ArrayLike, y: ArrayLike | None = None, *, folds: Ints | None = None) -> Self:
-        """Draw the kernels anew and fit the classifier heads; earlier fits are discarded.
-
-        If it raises, the earlier fit may be lost already, as after SettingError for a single class.
-        Unlike `train` it takes fewer than 20 traces, too. Of more than 4000 traces, the heads are
-        fitted to 4000.
-
-        Parameters
-        ----------
-        X : array of float, shape (n, T) or (n, C, T)
-        y : array, shape (n,)
-            Labels of two classes; the one that sorts last is success.
-        folds : array of int64, shape (n,), optional
-            Fold of each trace, 0 to K - 1. None: by a hash of its content.
-
-        Returns
-        -------
-        self
-
-        Raises
-        ------
-        SettingError
-            If a parameter is out of its range, labels or folds do not fit the traces, a trace has
-            a single sample, or the traces outside a fold have a single class.
-        TraceError, ValueError, TypeError
-            If X is not of one of these shapes or sparse, a value is not finite, or all samples are
-            below 1e-12 but not all are 0 (`check_traces`).
-        """
-        traces = self.check_traces(X, reset=True)
-        labels = binary_labels(y, len(traces), type(self).__name__)
-        folds = folds_of(traces, self.folds, folds)
-        self._initialize(traces)
+    def _fit(self, traces: Floats, labels: Ints, folds: Ints) -> None:
         check_classes(labels, self.training_masks(folds))
-        self._fit_heads(self.raw_features(traces), labels, folds)
-        return self
+        self.train_heads(traces, labels, folds, StopRule())
 
     def train(
         self,
@@ -364,83 +314,23 @@ class RocketReducer(Reducer):
     ) -> Floats:
         """Fit the classifier heads, starting from their last weights; return the reference points.
 
-        The kernels are drawn at the first call of `train`, `precompute` or `untrained_module` and
-        stay. X are traces (n, C, T), y (n,) their labels 1 or 0, `folds` (n,) their folds.
-        `numbers` (n,), those of the labels, increasing, identify the traces: a trace that was in
-        the last call of `train` or `precompute` has its features in a cache. None: nothing is
-        cached, and traces are chosen by their rows. `stop` may end the Newton steps, but in the
-        first fit its deadline leaves them three. If there are more than 4000 traces, the heads are
-        fitted to 4000 of them, chosen by a hash of the numbers. The module `net_`, and so the
-        module that `module` returned before, is changed in place. The points are float32 (n, d),
-        row i in embedding space ``folds[i]``. Raises the errors of `check_traces`, and SettingError
-        for fewer than 20 traces, if the traces outside a fold have a single class, and at the first
-        call for a parameter out of its range or fewer than 2 samples.
+        The kernels are drawn at the first call of `train` or `precompute` and stay. X are traces
+        (n, C, T), y (n,) their labels 1 or 0, `folds` (n,) their folds. `numbers` (n,), those of
+        the labels, increasing, identify the traces: a trace that was in the last call of `train` or
+        `precompute` has its features in a cache. None: nothing is cached, and traces are chosen by
+        their rows. `stop` may end the Newton steps, but in the first fit its deadline leaves them
+        three. If there are more than 4000 traces, the heads are fitted to 4000 of them, chosen by a
+        hash of the numbers. The module `net_`, and so the module that `module` returned before, is
+        changed in place. The points are float32 (n, d), row i in embedding space ``folds[i]``.
+        Raises the errors of `check_traces`, and SettingError for fewer than 20 traces, if the
+        traces outside a fold have a single class, and at the first call for a parameter out of its
+        range or fewer than 2 samples.
         """
         do = "verify more parts first"
         expect(len(X) >= MIN_TRACES, f"at least {MIN_TRACES} traces", len(X), do)
         traces = self._check_and_initialize(X)
-        labels = binary_labels(y, len(X), type(self).__name__)
-        check_classes(labels, self.training_masks(folds))
-        return self.train_heads(traces, labels, folds, stop, numbers)
-
-    def train_heads(
-        self,
-        traces: Floats,
-        labels: Ints,
-        folds: Ints,
-        stop: StopRule | None = None,
-        numbers: Ints | None = None,
-    ) -> Floats:
-        """Fit the classifier heads like `train`, but without checking the input.
-
-        Call `init_encoder` first: otherwise all kernels are 0, and the result is meaningless
-        without an error. Traces are (n, C, T), labels (n,) 1 or 0; they may be of one class. `stop`
-        and `numbers`, those of the labels, which must increase, are as in `train`. `net_` is
-        changed in place; `towers_` and what a fit reports (`n_iter_`, `holdout_losses_`, `note_`)
-        are replaced, and with `numbers` the cache, which then has these traces alone. Returns the
-        points of the traces, float32 (n, d), row i in embedding space ``folds[i]``, whose head did
-        not see the label of row i.
-        """
-        raw = self.raw_features(traces, numbers)
-        self._fit_heads(raw, labels, folds, stop, numbers)
-        with torch.inference_mode():
-            points = apply_in_chunks(self._embed_raw, raw, 16 * CHUNK)
-            return points_in_fold_space(points.numpy(), folds)
-
-    def untrained_module(self, X: Floats) -> FeatureEmbedding:
-        """Return the module that embeds traces, so that it can be compiled before the training.
-
-        It is `net_`, which later trainings change in place; before the first training its
-        classifier heads are 0. If no kernels are drawn yet, they are drawn here from the traces X
-        (n, C, T). If these are fewer than 20 (`MIN_TRACES`), the kernels are drawn in a clone,
-        whose module is returned, and this reducer stays as it is. Raises the errors of
-        `check_traces`, and SettingError for a parameter out of its range or fewer than 2 samples.
-        """
-        is_initialized = "net_" in vars(self)
-        reducer: Self = self if len(X) >= MIN_TRACES or is_initialized else clone(self)
-        reducer._check_and_initialize(X)
-        return reducer.net_
-
-    def precompute(self, X: Floats, numbers: Ints | None = None) -> None:
-        """Compute the features of traces (n, C, T), and cache them for the next `train`.
-
-        `train` finds them again by `numbers`, the numbers of the labels; without numbers nothing is
-        cached. The cache then holds these traces and no others. The first call also draws the
-        kernels. With fewer than `MIN_TRACES` traces nothing is done. Raises the errors of
-        `check_traces`, and at the first call those of `build`.
-        """
-        if len(X) >= MIN_TRACES:
-            self.raw_features(self._check_and_initialize(X), numbers)
-
-    def _check_and_initialize(self, X: Floats) -> Floats:
-        """Check traces and return them as (n, C, T); build the module `net_` at the first call.
-
-        The first traces set the shape, the scales of the channels and the kernels. Raises the
-        errors of `check_traces`, and at the first call those of `build`.
-        """
-        if "net_" not in vars(self):
-            self._initialize(self.check_traces(X, reset=True))
-        return self.check_traces(X)
+        check_classes(y, self.training_masks(folds))
+        return self.train_heads(traces, y, folds, stop or StopRule(), numbers)
 
     def _initialize(self, traces: Floats) -> None:
         """Build the module `net_`, with channel scales and kernels from traces (n, C, T).
@@ -448,22 +338,16 @@ class RocketReducer(Reducer):
         No label is read. Earlier fits are discarded. Raises SettingError for a parameter out of its
         range or fewer than 2 samples.
         """
-        self.build(traces.shape[1], traces.shape[2], averaging(torch.from_numpy(traces)))
-        self.init_encoder(traces)
-
-    def init_encoder(self, traces: Floats) -> None:
-        """Set the channel scales, the random kernels and their thresholds from traces (n, C, T).
-
-        `build` must have been called. No label is read.
-        """
-        generator = np.random.default_rng(seed_of(self.random_state))
-        self.net_.encoder.learn(torch.from_numpy(traces), generator)
+        x = torch.from_numpy(traces)
+        self.build(traces.shape[1], traces.shape[2], averaging(x))
+        self.net_.encoder.learn(x, np.random.default_rng(draw_seed(self.random_state)))
+        self.is_initialized_ = True
 
     def build(self, channels: int, samples: int, average: int) -> None:
         """Make the module `net_` for traces of this shape, with kernels and classifier heads of 0.
 
         `towers_` and the cache of features become empty, `n_fits_` and `n_component_traces_` 0;
-        what a fit reports (`n_iter_`, `holdout_losses_`, `note_`) stays. `average` is the number of
+        what a fit reports (`n_iter_`, `holdout_losses_`) stays. `average` is the number of
         samples that are averaged to one. Raises SettingError for a parameter out of its range or
         fewer than 2 samples.
         """
@@ -482,6 +366,7 @@ class RocketReducer(Reducer):
         )
         n_leading = min(N_LEADING, self.width, encoder.towers[0].stop)
         self.net_ = FeatureEmbedding(encoder, self.folds, self.n_components, n_leading).eval()
+        self.is_initialized_ = False  # until kernels are drawn or restored
         self.n_fits_ = 0
         self.n_component_traces_ = 0
         self.towers_: list[Tower] = []
@@ -489,62 +374,66 @@ class RocketReducer(Reducer):
         # The features of these, (n, P): an array is pickled at less cost than a tensor.
         self._raw = np.empty((0, len(encoder.gain)), dtype=np.float32)
 
-    def _fit_heads(
+    def train_heads(
         self,
-        raw: Tensor,
+        traces: Floats,
         labels: Ints,
         folds: Ints,
-        stop: StopRule | None = None,
+        stop: StopRule,
         numbers: Ints | None = None,
-    ) -> None:
-        """Fit the classifier heads of each `Tower`, and write them to `net_`, weighed to one logit.
+    ) -> Floats:
+        """Fit the classifier heads like `train`, but without checking the input.
 
-        Head k starts from its last weights. It is fitted on the rows outside fold k of `raw` (n,
-        P), of at most 4000 (`sample_rows`). `labels` (n,) are 1 or 0; for `numbers` see `train`.
-        `stop` may end each tower's Newton steps; in the first fit its deadline leaves three.
-        Components are new at the first fit, after every 20, and for at least 1.5 times as many rows
-        as the last ones. Sets `towers_`, `n_iter_` (most steps of a tower), `holdout_losses_`,
-        `n_fits_`, and `note_` (heads at their base rate in every tower, or "").
+        Call `_initialize` first. Traces are (n, C, T), labels (n,) 1 or 0; they may be of one
+        class. `stop` and `numbers`, those of the labels, which must increase, are as in `train`.
+
+        Head k starts from its last weights, and is fitted on the rows outside fold k of at most
+        4000 rows (`sample_rows`). `stop` may end each tower's Newton steps; in the first fit its
+        deadline leaves three. Components are new at the first fit, after every 20, and for at least
+        1.5 times as many rows as the last ones. The heads of each `Tower` are written to `net_`,
+        weighed to one logit. `towers_` and what a fit reports (`n_iter_`, most steps of a tower,
+        and `holdout_losses_`) are replaced, `n_fits_` grows, and with `numbers` the cache then has
+        these traces alone. Returns the points of the traces, float32 (n, d), row i in embedding
+        space ``folds[i]``, whose head did not see the label of row i.
         """
+        raw = self.raw_features(traces, numbers)
         with torch.no_grad():
             grew = len(raw) >= GROWTH * self.n_component_traces_
             if grew or self.n_fits_ % REFRESH_EVERY == 0:
                 self._compute_components(raw)
             min_steps = 0 if self.n_fits_ else MIN_FIRST_STEPS
-            if len(raw) > MAX_TRAINING_TRACES:
-                rows = sample_rows(len(raw), numbers)
-                raw = raw[rows]
-                labels = labels[rows]
-                folds = folds[rows]
-            f = self.net_.encoder.scale_features(raw)
-            y = torch.from_numpy(labels)
-            outside = torch.from_numpy(self.training_masks(folds))
-            towers = []
-            left_out = []
-            at_base_rate = []  # by tower, the heads that predict it
-            steps = []
+            rows = sample_rows(len(raw), numbers)
+            f = self.net_.encoder.scale_features(raw[rows])
+            y = torch.from_numpy(labels[rows])
+            outside = torch.from_numpy(self.training_masks(folds[rows]))
+            fits = []
             for tower, features in zip(self.towers_, self._tower_features(f), strict=True):
                 g = tower.components(features)
-                w, logits, heads, n_steps = fit_heads(
-                    g, y, outside, tower.w, self.l2, self.max_iter, stop, min_steps
-                )
-                towers.append(tower._replace(w=w))
-                left_out.append(logits)
-                at_base_rate.append(set(heads))
-                steps.append(n_steps)
-            penalties = [0.0] * (len(towers) - 1) + [PRODUCT_PENALTY]
-            shares, losses = weigh_towers(left_out, penalties, y, outside)
-            self._set_heads(towers, shares)
-        self.towers_ = towers
-        self.n_iter_ = max(steps)
+                fit = fit_heads(g, y, outside, tower.w, self.l2, self.max_iter, stop, min_steps)
+                fits.append(fit)
+            pairs = zip(self.towers_, fits, strict=True)
+            self.towers_ = [tower._replace(w=fit.w) for tower, fit in pairs]
+            penalties = [0.0] * (len(fits) - 1) + [PRODUCT_PENALTY]
+            shares, losses = weigh_towers([fit.left_out for fit in fits], penalties, y, outside)
+            self._set_heads(shares)
+        self.n_iter_ = max(fit.n_steps for fit in fits)
         self.holdout_losses_ = losses.numpy()
         self.n_fits_ += 1
-        useless = ", ".join(map(str, sorted(set.intersection(*at_base_rate))))
-        note = f"head {useless} predicts the base rate, which has the smaller held-out loss"
-        self.note_ = note if useless else ""
+        return points_in_fold_space(embed_in_chunks(self._embed_raw, raw, 16 * CHUNK), folds)
 
-    def _set_heads(self, towers: list[Tower], shares: list[Tensor]) -> None:
-        """Write the classifier heads of all towers to `net_`, which then gives K logits.
+    def precompute(self, X: Floats, numbers: Ints | None = None) -> None:
+        """Compute the features of traces (n, C, T), and cache them for the next `train`.
+
+        `train` finds them again by `numbers`, the numbers of the labels; without numbers nothing is
+        cached. The cache then holds these traces and no others. The first call also draws the
+        kernels. With fewer than `MIN_TRACES` traces nothing is done. Raises the errors of
+        `check_traces`, and at the first call those of `build`.
+        """
+        if len(X) >= MIN_TRACES:
+            self.raw_features(self._check_and_initialize(X), numbers)
+
+    def _set_heads(self, shares: list[Tensor]) -> None:
+        """Write the classifier heads of `towers_` to `net_`, which then gives K logits.
 
         Logit k of `net_`, for embedding space k, becomes the sum over the towers of share k times
         the tower's own logit k. `shares` has a tensor (K,) for each `Tower`; `weigh_towers` returns
@@ -554,7 +443,7 @@ class RocketReducer(Reducer):
         logit_columns = slice(0, net.n_scores, self.n_components)
         net.bias[logit_columns] = 0.0
         weights = [*(net.weight[columns] for columns in net.encoder.towers), net.product_weight]
-        for tower, share, tower_weight in zip(towers, shares, weights, strict=False):
+        for tower, share, tower_weight in zip(self.towers_, shares, weights, strict=False):
             weight, bias = tower.heads()
             tower_weight[:, logit_columns] = share * weight
             net.bias[logit_columns] += share * bias
@@ -610,26 +499,27 @@ class RocketReducer(Reducer):
         self.towers_.append(
             Tower.from_features(products, self.width, PRODUCT_VARIANCE, no_weights, no_logits)
         )
-        first = self.towers_[0]
-        columns = encoder.towers[0]
-        net.weight[columns, net.n_scores :] = first.axes[:, : net.n_leading]
-        net.bias[net.n_scores :] = first.centre[: net.n_leading]
-        if self.n_components == 2:
-            self._set_second_axis(f[:, columns], first.axes[:, 0])
+        self._set_axes(f[:, encoder.towers[0]])
 
-    def _set_second_axis(self, f: Tensor, axis: Tensor) -> None:
-        """Write the second coordinate of the embedding to `net_`: a sigmoid of a component.
+    def _set_axes(self, f: Tensor) -> None:
+        """Write the leading components of the first `Tower`, and the second coordinate, to `net_`.
 
-        `axis` (p,) is the axis of the component on the features `f` (n, p) of the first `Tower`.
-        Before the sigmoid the component is scaled to mean 0 and standard deviation 2 over `f`. Its
-        sign is changed if it would point against the second coordinate that `net_` had before.
+        If there is a second coordinate, it is a sigmoid of the first component. Before the sigmoid
+        the component is scaled to mean 0 and standard deviation 2 over the tower's features `f` (n,
+        p). Its sign is changed if it would point against the second coordinate that `net_` had
+        before.
         """
         net = self.net_
         columns = net.encoder.towers[0]
-        second = 2.0 * axis / (f @ axis).std().clamp(min=1e-12)
-        second = second if second @ net.weight[columns, 1] >= 0 else -second
-        net.weight[columns, 1 : net.n_scores : 2] = second[:, None]
-        net.bias[1 : net.n_scores : 2] = -(f.mean(0) @ second)
+        first = self.towers_[0]
+        net.weight[columns, net.n_scores :] = first.axes[:, : net.n_leading]
+        net.bias[net.n_scores :] = first.centre[: net.n_leading]
+        if self.n_components == 2:
+            axis = first.axes[:, 0]
+            second = 2.0 * axis / (f @ axis).std().clamp(min=1e-12)
+            second = second if second @ net.weight[columns, 1] >= 0 else -second
+            net.weight[columns, 1 : net.n_scores : 2] = second[:, None]
+            net.bias[1 : net.n_scores : 2] = -(f.mean(0) @ second)
 
     def raw_features(self, traces: Floats, numbers: Ints | None = None) -> Tensor:
         """Return the unscaled features (n, P) of traces (n, C, T), as a tensor.
@@ -646,52 +536,33 @@ class RocketReducer(Reducer):
                 return compute_raw_features(encoder, traces)
             positions = np.searchsorted(self._numbers, numbers)
             is_new = np.append(self._numbers, -1)[positions] != numbers
-            if is_new.all():
-                positions = np.arange(len(positions))
-                self._raw = compute_raw_features(encoder, traces).numpy()
-            elif is_new.any():
-                positions[is_new] = len(self._raw) + np.arange(is_new.sum())
-                new_features = compute_raw_features(encoder, traces[is_new]).numpy()
-                self._raw = np.concatenate([self._raw, new_features])
-            self._numbers = numbers
+            positions[is_new] = len(self._raw) + np.arange(is_new.sum())
+            new_features = compute_raw_features(encoder, traces[is_new]).numpy()
+            raw = np.concatenate([self._raw, new_features])
             # A slice copies nothing; it is enough unless a trace in between has left.
-            if len(positions) > 0 and (np.diff(positions) == 1).all():
-                self._raw = self._raw[positions[0] : positions[-1] + 1]
-            else:
-                self._raw = self._raw[positions]
+            is_slice = (np.diff(positions) == 1).all()
+            self._raw = raw[positions[0] : positions[-1] + 1] if is_slice else raw[positions]
+            self._numbers = numbers
         return torch.from_numpy(self._raw)
-
-    def __deepcopy__(self, memo: dict[int, Any]) -> Self:
-        """Copy the module, which a training changes in place, and share all else.
-
-        A training replaces all other attributes and changes none.
-        """
-        new = copy.copy(self)
-        if "net_" in vars(self):
-            new.net_ = copy.deepcopy(self.net_, memo)
-        return new
 
     @property
     def report(self) -> FitReport:
-        """Return the report of the last fit: Newton steps, and heads that predict the base rate.
+        """Return the report of the last fit: its Newton steps.
 
         Raises NotFittedError before there are kernels, AttributeError before the first fit.
         """
         check_is_fitted(self, "net_")
-        return FitReport(self.n_iter_, self.note_)
+        return FitReport(self.n_iter_)
 
     def embed(self, X: ArrayLike) -> Floats:
         """Embed traces (n, T) or (n, C, T) in every embedding space; return float32 (n, K, d).
 
         The points in space k come from head k, the classifier that was fitted without the labels of
-        fold k. If kernels were drawn (`precompute`, `untrained_module`) but nothing was fitted, all
-        probabilities are 0.5. Raises NotFittedError before there are kernels, ValueError for traces
-        of another shape and for values that are not finite.
+        fold k. If kernels were drawn (`precompute`) but nothing was fitted, all probabilities are
+        0.5. Raises NotFittedError before there are kernels, ValueError for traces of another shape
+        and for values that are not finite.
         """
-        traces = self.check_traces(X)
-        with torch.inference_mode():
-            points: Floats = apply_in_chunks(self.net_, torch.from_numpy(traces)).numpy()
-        return points
+        return embed_in_chunks(self.net_, torch.from_numpy(self.check_traces(X)), CHUNK)
 
     def _embed_raw(self, raw: Tensor) -> Tensor:
         """Raw features (n, P) -> (n, K, d)."""
@@ -706,7 +577,7 @@ class RocketReducer(Reducer):
 
         They are the shape, the counters, the losses, the fields of each `Tower`, and the tensors of
         `net_`, whose names begin with "net.". The cache of features is not among them. Losses and
-        towers are not copies; `note_` is not in it. Raises NotFittedError before there are kernels,
+        towers are not copies. Raises NotFittedError before there are kernels,
         AttributeError before the first fit.
         """
         check_is_fitted(self, "net_")
@@ -723,63 +594,55 @@ class RocketReducer(Reducer):
     def set_state(self, state: Arrays) -> Self:
         """Restore what `get_state` returned, and return self; the parameters must be the same.
 
-        Afterwards the cache of features is empty and `note_`, a line for the operator, is "".
+        Afterwards the cache of features is empty.
         Raises SettingError for a parameter out of its range, and StoreError if the sizes do not
         follow from the parameters; then the fitted model is lost. Raises KeyError if shape,
         counters or losses are missing.
         """
         channels, samples = self.restore_shape(state)
-        average, n_fits, n_component_traces, n_iter = map(int, state["counts"])
+        average, *counts = map(int, state["counts"])
         self.build(channels, samples, average)
         restore(self.net_, arrays_with_prefix(state, "net."))
         fields = [arrays_with_prefix(state, f"{name}.").values() for name in Tower._fields]
         for arrays in zip(*fields, strict=True):
             self.towers_.append(Tower(*map(torch.from_numpy, map(np.array, arrays))))
-        self.n_fits_ = n_fits
-        self.n_component_traces_ = n_component_traces
-        self.n_iter_ = n_iter
+        self.n_fits_, self.n_component_traces_, self.n_iter_ = counts
         self.holdout_losses_ = np.array(state["losses"])
-        self.note_ = ""
+        self.is_initialized_ = True
         return self
 
     def check(self) -> None:
         """Raise SettingError for a parameter out of its range.
 
-        `kernels`, `dilations`, `width` and `max_iter` are integers of at least 1 and at most a
-        billion, `regions` is an integer from 1 to 16 and `groups` from 0 to 64, `n_components` is 1
-        or 2, and `folds` at least 2. `l2` is above 0.
+        All but `l2` are integers: `kernels`, `dilations`, `width` and `max_iter` from 1 to a
+        billion, `regions` from 1 to 16, `groups` from 0 to 64, `n_components` 1 or 2, and `folds`
+        from 2 to 1000. `l2` is above 0.
         """
-        integers = (
-            "n_components",
-            "folds",
-            "max_iter",
-            "kernels",
-            "dilations",
-            "regions",
-            "width",
+        check_integers(
+            self,
+            n_components=(1, 2),
+            folds=(2, 1000),
+            kernels=(1, MAX_INTEGER),
+            dilations=(1, MAX_INTEGER),
+            regions=(1, 16),
+            groups=(0, 64),
+            width=(1, MAX_INTEGER),
+            max_iter=(1, MAX_INTEGER),
         )
-        for name in integers:
-            value = getattr(self, name)
-            expect(is_whole(value, 1, MAX_INTEGER), f"{name} >= 1, an integer", value)
-        expect(self.regions <= 16, "regions <= 16", self.regions)
-        expect(is_whole(self.groups, 0, 64), "groups from 0 to 64, an integer", self.groups)
-        expect(self.n_components <= 2, "n_components 1 or 2", self.n_components)
         expect(self.l2 > 0, "l2 > 0, or separable labels have no solution", self.l2)
-        expect(self.folds >= 2, "folds >= 2 where labels are used", self.folds)
 
 
-def sample_rows(n: int, numbers: Ints | None) -> Ints:
+def sample_rows(n: int, numbers: Ints | None) -> Ints | slice:
     """Draw `MAX_TRAINING_TRACES` of n rows, without reading labels; return them in order.
+
+    If there are no more rows than that, all are returned, as a slice.
 
     A hash of the labels' numbers (n,) draws them, evenly in time. So most rows are those of the
     last fit, and the heads start near their final weights. If `numbers` is None, they are 0 to
-    n - 1. n must be larger than `MAX_TRAINING_TRACES`.
+    n - 1.
     """
+    if n <= MAX_TRAINING_TRACES:
+        return slice(None)
     values = np.arange(n) if numbers is None else numbers
     hashes = values.astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15)
     return np.sort(np.argpartition(hashes, MAX_TRAINING_TRACES)[:MAX_TRAINING_TRACES])
-
-
-def apply_in_chunks(function: Callable[[Tensor], Tensor], x: Tensor, size: int = CHUNK) -> Tensor:
-    """Apply a function to x (n, ...) `size` rows at a time, and join what it returns."""
-    return torch.cat([function(x[i : i + size]) for i in range(0, max(1, len(x)), size)])

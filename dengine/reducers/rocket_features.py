@@ -107,7 +107,6 @@ class RocketEncoder(nn.Module):
         self.n_dilations = len(taps)
         self.n_regions = regions
         self.n_kernels = kernels
-        self.n_places = places
         self.n_groups = groups
         self.group_size = GROUP_SIZE
         self.kernel_size = TAPS
@@ -209,7 +208,7 @@ class RocketEncoder(nn.Module):
         """
         channels = values.size(0)
         taps = self.kernel_size
-        columns = values.size(1) // (n * taps) * values.size(2)  # -1 cannot be inferred for n = 0
+        columns = values.size(1) // (n * taps) * values.size(2)
         if channels == 1:
             return values.reshape(n, taps, columns)
         by_dilation = values.reshape(channels, n, taps, columns).transpose(0, 1)
@@ -335,12 +334,11 @@ def compute_raw_features(encoder: RocketEncoder, traces: Floats) -> Tensor:
     The encoder computes 32 traces at a time. The features of a trace are the same to the bit
     whatever other traces it comes with, since the last 32 are filled up with traces of zeros.
     """
-    out = torch.empty(len(traces), len(encoder.gain))
-    for start in range(0, len(traces), CHUNK):
-        chunk = torch.from_numpy(traces[start : start + CHUNK])
+    features = []
+    for chunk in torch.split(torch.from_numpy(traces), CHUNK):
         full = nn.functional.pad(chunk, [0, 0, 0, 0, 0, CHUNK - len(chunk)])
-        out[start : start + CHUNK] = encoder.raw_features(full)[: len(chunk)]
-    return out
+        features.append(encoder.raw_features(full)[: len(chunk)])
+    return torch.cat(features)
 
 
 def rocket_kernels() -> Tensor:
@@ -352,20 +350,16 @@ def rocket_kernels() -> Tensor:
     return torch.full((84, TAPS), -1.0).scatter_(1, places, 2.0)
 
 
-def dilation_steps(samples: int, n: int) -> list[int]:
-    """Return at most n dilations, from 1 to that at which a kernel spans `samples` samples."""
-    widest = np.log2((samples - 1) / (TAPS - 1)) if samples > TAPS else 0.0
-    return [int(d) for d in np.unique(np.floor(2.0 ** np.linspace(0.0, widest, n)))]
-
-
 def tap_positions(frames: int, dilations: int, places: int) -> NDArray[np.int64]:
     """Return the frame that each tap of a kernel reads, int64 (D, 9, P), for P places in a trace.
 
-    A tap is one of the nine inputs of a kernel. `dilations` is the largest D; D is smaller for
+    A tap is one of the nine inputs of a kernel. The dilations are spaced evenly in their logarithm,
+    from 1 to that at which a kernel spans the trace. `dilations` is the largest D; D is smaller for
     short traces. For a tap beyond the ends of the trace the position is
     ``2 * frames - 1``, at which `RocketEncoder.read_taps` finds a zero.
     """
-    steps = np.array(dilation_steps(frames, dilations), dtype=np.int64)
+    widest = np.log2((frames - 1) / (TAPS - 1)) if frames > TAPS else 0.0  # spans the trace
+    steps = np.unique(np.floor(2.0 ** np.linspace(0.0, widest, dilations))).astype(np.int64)
     middle = ((np.arange(places) + 0.5) / places * frames).astype(np.int64)
     taps = middle + steps[:, None, None] * (np.arange(TAPS) - TAPS // 2)[:, None]
     return np.where((taps < 0) | (taps >= frames), 2 * frames - 1, taps)

@@ -24,16 +24,15 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache, lru_cache
 from os import PathLike
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike
-from sklearn.base import clone
 from sklearn.utils.validation import check_is_fitted
 from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812  # PyTorch's own documentation calls it so
 from torch.nn.modules.batchnorm import _BatchNorm
+from torch.nn.utils.rnn import pad_sequence
 
 from ..decision.scripting import (
     arrays_with_prefix,
@@ -44,28 +43,28 @@ from ..decision.scripting import (
     script,
 )
 from ..errors import SettingError, counted, expect, log
-from ..records import Arrays, State, is_number, is_whole
+from ..records import Arrays, State, is_number
 from .base import (
     SAME_POINTS,
     FitReport,
     Floats,
     Ints,
-    Reducer,
     StopRule,
-    binary_labels,
+    check_integers,
     draw_seed,
-    folds_of,
+    embed_in_chunks,
 )
 from .checkpoints import load_checkpoint
 from .encoder import Encoder, Members, NetworkFactory, fold_batch_norms
 from .preprocessing import Preprocessor, averaging
+from .probability import ProbabilityReducer
 
-MIN_TRACES = 20  # of the first training
 CHUNK = 64  # traces that are embedded at once: what they need stays in the cache
 STATISTICS_TRACES = 256  # from which the statistics of batch normalisation are estimated
 STEPS_PER_LABEL = 1.2  # that training must have had before it is called complete,
 INITIAL_STEPS = 36  # on top of these
 MANY_LABELS = 4000  # labels beyond which embedding them leaves no time for more steps
+MAX_INTEGER = 10**6  # of a parameter
 CATCH_UP_FACTOR = 2  # times the steps of a retrain, as long as training is behind
 
 
@@ -123,7 +122,7 @@ class Augmentation:
 
 
 @dataclass(eq=False, repr=False, kw_only=True)
-class TorchReducer(Reducer):
+class TorchReducer(ProbabilityReducer):
     """Embed traces by a PyTorch network, cross-fitted, that is trained some steps at each retrain.
 
     The first axis of the embedding is the predicted probability of success, the second the
@@ -175,16 +174,9 @@ class TorchReducer(Reducer):
         Mean training loss of the last retrain, in nats; NaN if it took no step.
     """
 
-    uses_labels = True
-    scores = True
-    own_unit = True
-    min_traces = MIN_TRACES
-    default_radius = 0.07  # of a probability
     default_retrain_every = 10  # small retrains often beat large ones seldom
 
     network: NetworkFactory
-    n_components: int = 2
-    folds: int = 5
     steps: int = 12
     fit_steps: int = 400
     batch_size: int = 32
@@ -196,48 +188,6 @@ class TorchReducer(Reducer):
     noise: float = 0.03
     mixup: float = 0.1
     checkpoint: str = ""
-    random_state: Any = 0
-
-    @property
-    def n_spaces(self) -> int:
-        return int(self.folds)
-
-    def fit(self, X: ArrayLike, y: ArrayLike | None = None, *, folds: Ints | None = None) -> Self:
-        """Train `fit_steps` steps from initial weights; earlier trainings are discarded.
-
-        The initial weights are those of the checkpoint, if there is one. See `fit_loop` for the
-        steps. If it raises, earlier trainings may be lost already. Unlike `train` it takes fewer
-        than 20 traces, too.
-
-        Parameters
-        ----------
-        X : array of float, shape (n, T) or (n, C, T)
-        y : array, shape (n,)
-            Labels of two classes; the one that sorts last is success. A single class is trained on,
-            too.
-        folds : array of int64, shape (n,), optional
-            Fold of each trace, 0 to K - 1. None: by a hash of its content.
-
-        Returns
-        -------
-        self
-
-        Raises
-        ------
-        SettingError
-            If a parameter is out of its range, labels or folds do not fit the traces, the network
-            does not give (B, features), the checkpoint cannot be used, a trace has a single sample,
-            or fewer than two traces lie outside a fold.
-        TraceError, ValueError, TypeError
-            If X is not of one of these shapes or sparse, a value is not finite, or all samples are
-            below 1e-12 but not all are 0 (`check_traces`).
-        """
-        traces = self.check_traces(X, reset=True)
-        labels = binary_labels(y, len(traces), type(self).__name__)
-        folds = folds_of(traces, self.folds, folds)
-        self._initialize(traces)
-        self._train(traces, labels, folds, StopRule(), steps=self.fit_steps)
-        return self
 
     def train(
         self,
@@ -258,9 +208,8 @@ class TorchReducer(Reducer):
         used.
         """
         traces = self._check_and_initialize(X)
-        labels = binary_labels(y, len(X), type(self).__name__)
         steps = self.n_steps_due(len(traces))
-        return self._train(traces, labels, folds, stop or StopRule(), steps, numbers)
+        return self._train(traces, y, folds, stop or StopRule(), steps, numbers)
 
     def n_steps_due(self, n_labels: int) -> int:
         """Return the number of steps that the next retrain takes on `n_labels` labels.
@@ -278,19 +227,6 @@ class TorchReducer(Reducer):
         It is 36 plus 1.2 for each label, but at most `fit_steps`.
         """
         return int(min(self.fit_steps, INITIAL_STEPS + STEPS_PER_LABEL * n_labels))
-
-    def _check_and_initialize(self, X: Floats) -> Floats:
-        """Check traces and return them as (n, C, T); build the networks at the first call.
-
-        The first traces set the shape and the scales of the channels; no label is read. The first
-        call raises SettingError for fewer than 20 traces, and for a parameter, network or
-        checkpoint that cannot be used. Raises the errors of `check_traces`.
-        """
-        if not vars(self).get("is_initialized_"):
-            do = "verify more parts first"
-            expect(len(X) >= MIN_TRACES, f"at least {MIN_TRACES} traces", len(X), do)
-            self._initialize(self.check_traces(X, reset=True))
-        return self.check_traces(X)
 
     def _initialize(self, traces: Floats) -> None:
         """Build preprocessor, networks and `encoder_` anew for traces (n, C, T).
@@ -338,6 +274,9 @@ class TorchReducer(Reducer):
         self.n_steps_left_ = 0
         self.n_new_steps_ = 0
         self.loss_ = float("nan")
+
+    def _fit(self, traces: Floats, labels: Ints, folds: Ints) -> None:
+        self._train(traces, labels, folds, StopRule(), self.fit_steps)
 
     def _train(
         self,
@@ -436,14 +375,12 @@ class TorchReducer(Reducer):
         step of the optimiser changes `optimizer_state_`. Weight decay is only for parameters of two
         dimensions or more whose name ends in "weight", so not for biases and batch normalisation.
         """
-        decayed: list[nn.Parameter] = []
-        others: list[nn.Parameter] = []
+        parameters: dict[bool, list[nn.Parameter]] = {True: [], False: []}  # by whether they decay
         for name, parameter in self.members_.named_parameters():
-            is_weight = parameter.dim() > 1 and name.endswith("weight")
-            (decayed if is_weight else others).append(parameter)
-        groups: list[dict[str, Any]] = [
-            {"params": decayed, "weight_decay": self.weight_decay},
-            {"params": others, "weight_decay": 0.0},
+            parameters[parameter.dim() > 1 and name.endswith("weight")].append(parameter)
+        groups = [
+            {"params": parameters[True], "weight_decay": self.weight_decay},
+            {"params": parameters[False], "weight_decay": 0.0},
         ]
         optimizer = torch.optim.AdamW(groups, lr=self.learning_rate, fused=True)
         if self.optimizer_state_:
@@ -499,23 +436,14 @@ class TorchReducer(Reducer):
         Row i is in space ``folds[i]``, as a reference. Network k computes the rows of fold k alone,
         so this takes 1 / K of the time of `embed`.
         """
-        rows_of_fold = [np.flatnonzero(folds == k) for k in range(self.folds)]
-        longest = max(map(len, rows_of_fold))
-        columns = [
-            np.resize(rows, longest) if len(rows) else np.zeros(longest, np.int64)
-            for rows in rows_of_fold
-        ]
-        table = np.stack(columns, axis=1)  # (longest, K): rows of shorter folds are repeated
-        points = np.empty((len(x), self.n_components), dtype=np.float32)
-        for first in range(0, longest, CHUNK):
-            batch = torch.from_numpy(table[first : first + CHUNK])  # (B, K)
-            embedded = self.encoder_.embed(x[batch]).numpy()  # (B, K, d)
-            for k, rows in enumerate(rows_of_fold):
-                n_left = max(0, len(rows) - first)
-                points[rows[first : first + CHUNK]] = embedded[:n_left, k]
-        return points
+        rows_of_fold = [torch.from_numpy(np.flatnonzero(folds == k)) for k in range(self.folds)]
+        points = torch.empty(len(x), self.n_components)
+        # Column k has the rows of fold k, and -1 after the last one.
+        for rows in torch.split(pad_sequence(rows_of_fold, padding_value=-1), CHUNK):  # (B, K)
+            is_row = rows >= 0
+            points[rows[is_row]] = self.encoder_.embed(x[rows])[is_row]
+        return points.numpy()
 
-    @torch.inference_mode()
     def embed(self, X: Floats) -> Floats:
         """Embed traces (n, T) or (n, C, T) in every embedding space; return float32 (n, K, d).
 
@@ -524,29 +452,10 @@ class TorchReducer(Reducer):
         ValueError for traces of another shape.
         """
         check_is_fitted(self, "encoder_")
-        traces = torch.from_numpy(self.check_traces(X))
-        chunks = torch.split(traces, CHUNK)
-        if not len(X):
-            return np.empty((0, self.n_spaces, self.n_components), np.float32)
-        return torch.cat([self.encoder_(chunk) for chunk in chunks]).numpy()
+        return embed_in_chunks(self.encoder_, torch.from_numpy(self.check_traces(X)), CHUNK)
 
     def warm_up(self) -> None:
         warm_optimizer()
-
-    def untrained_module(self, X: Floats) -> nn.Module | None:
-        """Return a module that can be compiled before the training on traces X (n, C, T).
-
-        It is `module()` if the reducer has an `encoder_` already. Otherwise it is the module of a
-        clone with initial weights, and this reducer stays as it is. None, with a warning in the
-        log, if TorchScript cannot compile the network. Raises SettingError for a parameter or a
-        network that cannot be used.
-        """
-        if "encoder_" in vars(self):
-            return self.module()
-        untrained: Self = clone(self)
-        untrained._build(X.shape[1], X.shape[2], averaging(torch.from_numpy(X)))
-        untrained.encoder_ = untrained._new_encoder()
-        return untrained.module()
 
     def module(self) -> nn.Module | None:
         """Return the module that embeds, (B, C, T) -> (B, K, d), for compiling or exporting.
@@ -612,11 +521,9 @@ class TorchReducer(Reducer):
         or network that cannot be used. After an error do not use the reducer.
         """
         channels, samples = self.restore_shape(state)
-        average, seed, n_steps, n_steps_left, n_new_steps = map(int, state["counts"])
+        average, seed, *counts = map(int, state["counts"])
         self._build(channels, samples, average, seed)
-        self.n_steps_ = n_steps
-        self.n_steps_left_ = n_steps_left
-        self.n_new_steps_ = n_new_steps
+        self.n_steps_, self.n_steps_left_, self.n_new_steps_ = counts
         self.loss_ = float(state["loss"])
         for name, module in self._modules().items():
             # A state of an earlier release lacks buffers that are not persistent.
@@ -663,12 +570,15 @@ class TorchReducer(Reducer):
         learning_rate above 0, weight_averaging below 1, and no other number is negative or
         infinite. checkpoint is a text or path; no file is looked at.
         """
-        expect(self.n_components in (1, 2), "n_components 1 or 2", self.n_components)
-        smallest = {"folds": 2, "steps": 1, "fit_steps": 1, "batch_size": 2, "shift": 0}
-        for name, least in smallest.items():
-            value = getattr(self, name)
-            expect(is_whole(value, least, 10**6), f"{name} >= {least}, an integer", value)
-        expect(self.folds <= 1000, "folds <= 1000", self.folds)
+        check_integers(
+            self,
+            n_components=(1, 2),
+            folds=(2, 1000),
+            steps=(1, MAX_INTEGER),
+            fit_steps=(1, MAX_INTEGER),
+            batch_size=(2, MAX_INTEGER),
+            shift=(0, MAX_INTEGER),
+        )
         not_negative = "learning_rate", "weight_averaging", "weight_decay", "gain", "noise", "mixup"
         for name in not_negative:
             value = getattr(self, name)
@@ -717,12 +627,12 @@ def draw_batches(
             "Check the sensor and the unit."
         )
     size = min(batch_size, smallest)
-    drawn = np.empty((steps, size, n_folds), dtype=np.int64)
-    for k, pool in enumerate(pools):
+    columns = []
+    for pool in pools:
         n_passes = -(-steps * size // len(pool))
         order = np.concatenate([rng.permutation(pool) for _ in range(n_passes)])
-        drawn[:, :, k] = order[: steps * size].reshape(steps, size)
-    yield from torch.from_numpy(drawn)
+        columns.append(order[: steps * size].reshape(steps, size))
+    yield from torch.from_numpy(np.stack(columns, axis=2))
 
 
 @cache

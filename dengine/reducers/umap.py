@@ -37,7 +37,17 @@ from torch import Tensor, nn
 from ..decision.scripting import arrays_with_prefix, module_state, restore
 from ..errors import SettingError, expect
 from ..records import Arrays, State, is_number, is_whole
-from .base import FitReport, Floats, Ints, Reducer, StopRule, as_points, draw_seed
+from .base import (
+    FitReport,
+    Floats,
+    Ints,
+    Reducer,
+    StopRule,
+    as_points,
+    check_integers,
+    draw_seed,
+    embed_in_chunks,
+)
 from .umap_graph import (
     CHUNK,
     Frames,
@@ -251,8 +261,7 @@ class UmapReducer(Reducer):
             If X is not of one of these shapes or sparse, a value is not finite, or all samples are
             below 1e-12 but not all are 0 (`check_traces`).
         """
-        traces = self.check_traces(X, reset=True)
-        self.check(len(traces))
+        traces = self._check(X, reset=True)
         self._initialize(traces)
         self._train(traces, None, StopRule(), self._n_first_epochs)
         return self
@@ -276,8 +285,7 @@ class UmapReducer(Reducer):
         `embedding_`. Raises the errors of `check_traces`, and SettingError for a parameter out of
         its range, or too few traces.
         """
-        traces = self.check_traces(X, reset=not self._is_fitted)
-        self.check(len(traces))
+        traces = self._check(X, reset=not self._is_fitted)
         if numbers is None or not self._has_searched_any(numbers):
             self._initialize(traces)
         self._train(traces, numbers, stop or StopRule())
@@ -307,8 +315,7 @@ class UmapReducer(Reducer):
         """
         if numbers is None:
             return
-        traces = self.check_traces(X, reset=not self._is_fitted)
-        self.check(len(traces))
+        traces = self._check(X, reset=not self._is_fitted)
         if not self._is_fitted:
             self._initialize(traces)
         neighbors = self.neighbors_.update(traces, numbers, self.make_frames_)
@@ -419,7 +426,6 @@ class UmapReducer(Reducer):
         )
         self.encoder_ = encoder.eval()
 
-    @torch.inference_mode()
     def embed(self, X: Floats) -> Floats:
         """Embed traces (n, T) or (n, C, T) among the references; return float32 (n, 1, d).
 
@@ -427,8 +433,7 @@ class UmapReducer(Reducer):
         traces of another shape.
         """
         check_is_fitted(self, "encoder_")
-        traces = torch.from_numpy(self.check_traces(X))
-        return torch.cat([self.encoder_(chunk) for chunk in torch.split(traces, CHUNK)]).numpy()
+        return embed_in_chunks(self.encoder_, torch.from_numpy(self.check_traces(X)), CHUNK)
 
     def untrained_module(self, X: Floats) -> UmapEncoder:
         """Return a module that can be compiled before the training on traces X (n, C, T).
@@ -461,13 +466,10 @@ class UmapReducer(Reducer):
         """Return the report of the last training: its epochs, and the epochs that are missing.
 
         A first layout, which starts from eigenvectors of the graph, takes 200 epochs (or
-        `n_epochs`), in one training or in several. The note says how many of them are missing; it
-        is "" if none is missing. Raises NotFittedError before a fit.
+        `n_epochs`), in one training or in several. Raises NotFittedError before a fit.
         """
         check_is_fitted(self, "encoder_")
-        left = self.n_steps_left_
-        note = f"{left} epochs of the first layout to go" if left else ""
-        return FitReport(self.n_new_steps_, note, left)
+        return FitReport(self.n_new_steps_, n_steps_left=self.n_steps_left_)
 
     def get_state(self) -> State:
         """Return arrays from which `set_state` restores the reducer bit for bit, by name.
@@ -497,11 +499,8 @@ class UmapReducer(Reducer):
         KeyError if another array is missing. The parameters are not compared with the state.
         """
         channels, samples = self.restore_shape(state)
-        n_frames, seed, n_epochs, n_steps, n_new_steps = (int(value) for value in state["counts"])
-        self.seed_ = seed
-        self.n_epochs_ = n_epochs
-        self.n_steps_ = n_steps
-        self.n_new_steps_ = n_new_steps
+        n_frames, *counts = map(int, state["counts"])
+        self.seed_, self.n_epochs_, self.n_steps_, self.n_new_steps_ = counts
         self.make_frames_ = Frames(channels, samples, n_frames)
         restore(self.make_frames_, arrays_with_prefix(state, "frames."))
         neighbors = Neighbors(
@@ -513,19 +512,21 @@ class UmapReducer(Reducer):
         self._set_references(neighbors, torch.from_numpy(np.array(state["embedding"])))
         return self
 
-    def check(self, n_traces: int) -> None:
-        """Raise SettingError for a parameter out of its range, or too few traces.
+    def _check(self, X: ArrayLike, reset: bool) -> Floats:
+        """Check traces and parameters, and return the traces as `check_traces` does.
 
-        n_components must be an integer from 1 to 100, n_neighbors from 2 to 1000, and there must be
-        more traces than either. min_dist is from 0 to 1, n_epochs an integer of at least 1 or None.
+        Raises SettingError for a parameter out of its range, or too few traces. n_components must
+        be an integer from 1 to 100, n_neighbors from 2 to 1000, and there must be more traces than
+        either. min_dist is from 0 to 1, n_epochs an integer of at least 1 or None.
         """
-        expect(is_whole(self.n_components, 1, 100), "n_components from 1 to 100", self.n_components)
-        expect(is_whole(self.n_neighbors, 2, 1000), "n_neighbors from 2 to 1000", self.n_neighbors)
+        traces = self.check_traces(X, reset=reset)
+        check_integers(self, n_components=(1, 100), n_neighbors=(2, 1000))
         is_distance = is_number(self.min_dist) and 0.0 <= self.min_dist <= 1.0
         expect(is_distance, "min_dist from 0 to 1", self.min_dist)
         epochs = self.n_epochs
         expect(epochs is None or is_whole(epochs, 1, 10**6), "n_epochs of 1 or more", epochs)
         smallest = max(self.n_neighbors, self.n_components)
-        if n_traces <= smallest:
-            actual = f"n_samples = {n_traces}"
+        if len(traces) <= smallest:
+            actual = f"n_samples = {len(traces)}"
             raise SettingError(f"UMAP needs more than {smallest} traces, got {actual}.")
+        return traces

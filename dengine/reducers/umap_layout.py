@@ -97,10 +97,10 @@ def leading_eigenvectors(
     eigenvectors are computed instead, without `rng`.
     """
     root = np.sqrt(np.asarray(graph.sum(1), dtype=np.float64)).ravel()
-    coordinates = graph.tocoo()
-    values = coordinates.data / (root[coordinates.row] * root[coordinates.col])
-    normalised = csr_matrix((values, (coordinates.row, coordinates.col)), graph.shape)
-    size = graph.shape[0]
+    edges = graph.tocoo()
+    edges.data = edges.data / (root[edges.row] * root[edges.col])
+    normalised = edges.tocsr()
+    size = len(root)
     if size <= max(DENSE_TRACES, 4 * n):
         _, all_vectors = torch.linalg.eigh(torch.from_numpy(normalised.toarray()))
         return np.asarray(all_vectors[:, -1 - n : -1])

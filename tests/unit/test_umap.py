@@ -199,8 +199,8 @@ def test_an_onnx_file_decides_as_the_model_does(make_data, tmp_path):
     ("name", "value", "message"),
     [
         ("n_neighbors", 15, "UMAP needs more than 15 traces, got n_samples = 15"),
-        ("n_components", 0, "Expected n_components from 1 to 100, got 0"),
-        ("n_neighbors", 1, "Expected n_neighbors from 2 to 1000, got 1"),
+        ("n_components", 0, "Expected n_components from 1 to 100, an integer, got 0"),
+        ("n_neighbors", 1, "Expected n_neighbors from 2 to 1000, an integer, got 1"),
         ("min_dist", 1.5, "Expected min_dist from 0 to 1, got 1.5"),
         ("n_epochs", 0, "Expected n_epochs of 1 or more, got 0"),
     ],
