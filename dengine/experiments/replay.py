@@ -223,6 +223,8 @@ class Replay:
         counts = self.stretch()
         summary = ", ".join(f"{counts[name]} {name.replace('_', ' ')}" for name in COUNTED[:5])
         cycles = f"{self.recipe.policy.summary}, {len(self)} cycles"
+        if self.dropped:
+            summary += f"; {len(self.dropped)} retrains dropped, the last {self.dropped[-1]}"
         return f"<Replay of {self.name}: {cycles}, {summary}>"
 
     @property

@@ -17,13 +17,14 @@ from ..records import Action, Outcome
 from .service import CellService
 
 N_FAST = 150  # parts that are played without a pause, so that a model is soon ready
+SECONDS = 1.0  # from one part to the next, after those
 CHECK_SHARE = 0.4  # of a cycle, after which the result of a verification is there
 POLL_SECONDS = 0.05  # between two looks at whether a retrain has ended
 POLICY = {"alpha": 0.1, "lower_bound": 0.9, "audit_rate": 0.05}
 
 
 @asynccontextmanager
-async def playing(service: CellService, data: Any, speed: float, seed: int) -> AsyncIterator[None]:
+async def playing(service: CellService, data: Any, seed: int) -> AsyncIterator[None]:
     """Play recordings through the service in a random order, in a task beside the context's block.
 
     The task plays each recording once, and is cancelled when the context ends. It reports the
@@ -35,8 +36,6 @@ async def playing(service: CellService, data: Any, speed: float, seed: int) -> A
     service : CellService
     data : object
         Anything that `load_dataset` takes.
-    speed : float
-        Parts per second after the first `N_FAST`, which are played without a pause.
     seed : int
         Seed of the random order.
 
@@ -47,7 +46,7 @@ async def playing(service: CellService, data: Any, speed: float, seed: int) -> A
     """
     cell = ReplayCell(data)
     cell.order = np.random.default_rng(seed).permutation(len(cell.data))
-    task = asyncio.create_task(drive(service, cell, speed))
+    task = asyncio.create_task(drive(service, cell))
     try:
         yield
     finally:
@@ -55,22 +54,22 @@ async def playing(service: CellService, data: Any, speed: float, seed: int) -> A
         await asyncio.wait([task])
 
 
-async def drive(service: CellService, cell: ReplayCell, speed: float) -> None:
+async def drive(service: CellService, cell: ReplayCell) -> None:
     """Insert every part of a recording once, ask the service for a decision, and report the
     outcome.
 
     `cell` plays the recording, from its first part on. The recorded result is reported for verified
     parts, and for accepted parts that are bad, which stop the line. The first `N_FAST` parts come
-    without a pause, but a retrain that is under way is waited for; later parts come at `speed`
-    parts per second, and their report after 40 % of this time. An accepted good part and a rejected
-    part get no report. A log line says when all parts were played. An exception, also that of a
-    full queue, is logged and ends the demonstration, not the server.
+    without a pause, but a retrain that is under way is waited for; later parts come once a second,
+    and their report after 40 % of this time. An accepted good part and a rejected part get no
+    report. A log line says when all parts were played. An exception, also that of a full queue, is
+    logged and ends the demonstration, not the server.
     """
     loop = asyncio.get_running_loop()
     next_start = loop.time()
     try:
         for cycle in range(len(cell.order)):
-            seconds = 0.0 if cycle < N_FAST else 1.0 / speed
+            seconds = 0.0 if cycle < N_FAST else SECONDS
             next_start = max(next_start + seconds, loop.time())
             trace = cell.insert()
             decision = (await service.decide(trace, part=f"{cycle + 1:04d}")).decision

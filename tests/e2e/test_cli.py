@@ -17,7 +17,7 @@ from dengine.cli import main
 from dengine.cli.output import INTERRUPTED
 from dengine.datasets import importing
 from dengine.datasets.importing import import_labelled
-from dengine.engine.trainer import Limits
+from dengine.engine.trainer import Retrainer
 from tests.support.command_line import dengine, document, example_of, line_of, succeed, well
 from tests.support.driving import easy_parts
 from tests.support.exports import cell_journal
@@ -151,7 +151,7 @@ def test_training_goes_on_after_retrains_without_a_step(tmp_path, monkeypatch):
     with monkeypatch.context() as busy:
         # The attribute `data` of `dengine.cli` is the verb, not the module.
         busy.setattr(sys.modules["dengine.cli.data"], "MOST_EMPTY_RETRAINS", 2)
-        busy.setattr(Limits, "deadline", lambda limits, begin: begin - 1.0)
+        busy.setattr(Retrainer, "_step_seconds", lambda retrainer: -1.0)
         failed = dengine(*words, "--reducer", "conv")
         assert failed.exit_code == 1
         text = " ".join(failed.stderr.split())

@@ -49,9 +49,9 @@ def test_a_page_asks_nothing_of_the_network(site):
     assert re.findall(r"(?:url\(|@import )\s*[\"']?(?:https?:)?//[^)\"']*", styles) == []
 
 
-# What public methods return, and the methods that robots call: documented, not exported.
+# What public methods return, the methods that robots call, and a base: documented, not exported.
 RETURNED = """BackupReport Changed Corrections EngineState Explanation ExportedDecision ExportedModel
-HistoryFilter HistoryReport RobotCalls Status StoredDecision
+HistoryFilter HistoryReport ProbabilityReducer RobotCalls Status StoredDecision
 CorrectionTable DecisionTable EventTable LabelTable SettingTable VersionTable"""
 
 
