@@ -25,7 +25,7 @@ from ..datasets import load_dataset
 from ..decision.neighbours import fade
 from ..decision.policy import Policy
 from ..engine.engine import DataEngine
-from ..errors import expect
+from ..errors import SettingError, expect
 from ..recipe import RECIPES, Recipe
 from ..records import (
     ACTIONS,
@@ -493,6 +493,8 @@ def replay(
     seed: int = 0,
     cycles: int | None = None,
     *,
+    alpha: float | None = None,
+    lower_bound: float | None = None,
     shuffle: bool = True,
     confirm: bool = False,
     on_cycle: Callable[[int], None] | None = None,
@@ -514,6 +516,8 @@ def replay(
         decisions, but not with an engine of yours whose trainings end by a time budget.
     cycles : int or None, default None
         Only the first so many parts, after the shuffle; None plays all.
+    alpha, lower_bound : float or None, default None
+        Of the policy; None takes the recipe's, which are 0.05 and 0.95 by default.
     shuffle : bool, default True
         False plays the stream in its recorded order, drift included.
     confirm : bool, default False
@@ -530,8 +534,9 @@ def replay(
     ------
     SettingError
         A number of cycles that the data set does not have, anything that is no recipe, a baseline
-        that cannot be made, a malformed `windows.trigger` of the data's description, or a policy
-        with force limits in seconds for a data set of an unknown rate.
+        that cannot be made, alpha or lower_bound out of range or beside an engine, a malformed
+        `windows.trigger` of the data's description, or a policy with force limits in seconds for a
+        data set of an unknown rate.
     DataError
         A data set that cannot be read.
     StoreError
@@ -540,7 +545,16 @@ def replay(
         For an engine of yours, traces that it does not take.
     """
     data = load_dataset(dataset)
-    contender = None if isinstance(recipe, DataEngine) else Contender.load(recipe)
+    changes = {"alpha": alpha, "lower_bound": lower_bound}
+    changes = {name: value for name, value in changes.items() if value is not None}
+    contender = None
+    if not isinstance(recipe, DataEngine):
+        contender = Contender.load(recipe).with_policy(**changes)
+    elif changes:
+        raise SettingError(
+            "Expected the policy of an engine on the engine, "
+            f"got {' and '.join(changes)} beside an engine, which has its own; make it with them."
+        )
     n_cycles = len(data) if cycles is None else cycles
     expect(1 <= n_cycles <= len(data), f"1 to {len(data)} cycles from {data.name}", n_cycles)
     order = np.arange(len(data))

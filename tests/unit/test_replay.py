@@ -55,9 +55,12 @@ def test_fewer_cycles_are_the_beginning_of_the_same_pass_told_one_by_one(data, p
         replay(data, RECIPE, cycles=201)
 
 
-def test_a_replays_repr_shows_its_policy(data):
-    recipe = Recipe.load("pca").with_policy(alpha=0.3, lower_bound=0.7)
-    assert "alpha 0.3, LB 70 %" in repr(replay(data, recipe, cycles=30))
+def test_a_replays_repr_shows_its_policy_whose_two_numbers_may_be_given_directly(data):
+    run = replay(data, "pca", cycles=30, alpha=0.3, lower_bound=0.7)
+    assert run.recipe == Recipe.load("pca").with_policy(alpha=0.3, lower_bound=0.7)
+    assert "alpha 0.3, LB 70 %" in repr(run)
+    with pytest.raises(SettingError, match="alpha beside an engine"):
+        replay(data, DataEngine("pca"), cycles=30, alpha=0.3)
 
 
 def engine() -> DataEngine:
