@@ -262,7 +262,8 @@ class Feedback:
         A product is several cells whose labels have one sequence of numbers in the store. With or
         without a product, the rule first counts each check that has become overdue as a wrong
         decision. The store is not asked: these are the numbers that came with the labels drained so
-        far. Nothing is raised.
+        far. Labels of traces with a fault are passed over, and without a model that answers no
+        reference changes. Nothing is raised.
         """
         self._count_overdue()
         if not self._provisional:
@@ -277,9 +278,7 @@ class Feedback:
         self.new_labels = self._window.count_newer(after)
 
     def give_labels_back(self, n_labels: int) -> None:
-        """Count the labels of a retrain that was dropped as new again, so that the next one comes
-        soon.
-        """
+        """Count the labels of a dropped retrain as new again, so that the next one comes soon."""
         self.new_labels += n_labels
 
     def _count_overdue(self) -> None:

@@ -62,9 +62,9 @@ def make_engine(url: str | None) -> sa.Engine:
     Raises
     ------
     StoreError
-        For any other database, for a URL that cannot be read, has a NUL or is not UTF-8, for an
-        SQLite URL in memory or with a `file:` URI, and if the driver of PostgreSQL is not
-        installed. The message has no password.
+        For any other database, for a URL that cannot be read, has a NUL or is not UTF-8, for a
+        SQLite database in memory, for a file whose name begins with `file:`, which SQLite takes for
+        a URI, and if the driver of PostgreSQL is not installed. The message has no password.
     """
     if url is None:
         arguments = {"check_same_thread": False}
@@ -123,13 +123,15 @@ def _with_sqlite_events(engine: sa.Engine) -> sa.Engine:
 def _connect_sqlite(
     dialect: Any, record: Any, arguments: Sequence[Any], options: Mapping[str, Any]
 ) -> Any:
-    """Return a new SQLite connection; it only reads if the file or its folder cannot be written.
+    """Return a new SQLite connection; a file that cannot be written is opened for reading.
 
     SQLAlchemy calls this with its dialect, its own record of the connection, which is not used, and
-    the arguments and options for `sqlite3.connect`; the first argument is the file. If it or its
-    folder cannot be written, and it has no `-wal` beside it, it is opened as immutable. Every other
-    file is opened in the driver's own way. A damaged file raises nothing here, but when the
-    connection is used. Raise sqlite3.Error if the file cannot be opened.
+    the arguments and options for `sqlite3.connect`; the first argument is the file. If the file or
+    its folder cannot be written, and the file has no `-wal` beside it, it is opened as immutable:
+    it can only be read, and what another process writes meanwhile may be missed. Every other file
+    is opened in the driver's own way. A damaged file raises nothing here, but when the connection
+    is used; so does a file with a `-wal` for which SQLite can create no `-shm`. Raise sqlite3.Error
+    if the file cannot be opened.
     """
     file = Path(str(arguments[0]))
     is_closed = file.is_file() and not Path(f"{file}-wal").exists()

@@ -68,14 +68,16 @@ class RecordInsertion:
     def _insert(self, connection: sa.Connection, records: Sequence[Record]) -> LabelNumbers:
         """Insert the records that are not stored yet; nothing is committed.
 
-        A record that contradicts the store, or a label whose decision is not stored, becomes an
-        event, "dead letter". No two decisions among the records may have one id. A line stop of a
-        part that had counted as good (`_is_late_stop`) corrects the label of that part, with an
-        event, unless it is a failure already. Return one pair (decision id, number) for each
-        decision that has a label among the records, unless that becomes a dead letter: the number
-        of its first label, whether that is new, was stored before, or is corrected by a late stop.
-        A new label keeps a positive number that is still free (`Database.insert`), and is
-        quarantined (kept out of training) if its decision is.
+        The first label of a decision is inserted. A second one that repeats success and source of
+        the first changes nothing. A record that contradicts the store, or a label whose decision is
+        not stored, becomes an event, "dead letter", which is also logged as an error. No two
+        decisions among the records may have one id. A line stop of a part that had counted as good
+        (`_is_late_stop`) corrects the label of that part, with an event, unless it is a failure
+        already. Return one pair (decision id, number) for each decision that has a label among the
+        records, unless that becomes a dead letter: the number of its first label, whether that is
+        new, was stored before, or is corrected by a late stop. A new label keeps a positive number
+        that is still free (`Database.insert`), and is quarantined (kept out of training) if its
+        decision is.
         """
         events = [record for record in records if isinstance(record, Event)]
         decisions = [record for record in records if isinstance(record, StoredDecision)]
@@ -118,7 +120,8 @@ class RecordInsertion:
         """Insert the decisions that are not stored yet, with their traces; nothing is committed.
 
         Return a text for each decision whose id is stored with other values, in columns or trace.
-        The stored values are not changed. No two of the decisions may have one id.
+        A decision that is stored with the same values is passed over. The stored values are not
+        changed. No two of the decisions may have one id.
         """
         trace_columns = TRACE.c["decision_id", "channels", "samples", "data"]
         query = sa.select(*DECISION.c, *trace_columns).select_from(WITH_TRACES)

@@ -282,21 +282,28 @@ class Journal:
                 return
             begin += 1 + (mark if mark >= 0 else len(block) - len(MARK))
 
-    def decode_undrained(self) -> list[Record]:
-        """Return the records that the store lacks, oldest first, without those that are replaced.
+    def decode_undrained(self) -> Iterator[Record]:
+        """Yield the records that the store lacks, oldest first, without those that are replaced.
 
         If several decisions have one id, the last replaces the others. Damaged records are left
-        out; the attribute `loss` says so. Raise StoreError for an intact record that cannot be
-        decoded, like that of another release of dengine, and OSError if the disk cannot be read.
+        out; the attribute `loss` says so. The file is read twice, so that it need not fit into
+        memory. Raise StoreError, before the first record is yielded, for an intact record that
+        cannot be decoded, like that of another release of dengine, and OSError if the disk cannot
+        be read.
         """
-        records = [decode_record(blob) for _, _, blob in self.undrained_records()]
-        decisions = [record for record in records if isinstance(record, StoredDecision)]
-        last = {item.decision.id: item for item in decisions}
-        return [
-            record
-            for record in records
-            if not isinstance(record, StoredDecision) or last[record.decision.id] is record
-        ]
+        newest: dict[str, int] = {}  # where the newest decision of an id stands
+        for offset, _, blob in self.undrained_records():
+            record = decode_record(blob)
+            if isinstance(record, StoredDecision):
+                newest[record.decision.id] = offset
+        for offset, _, blob in self.undrained_records():
+            record = decode_record(blob)
+            # An id may be unknown: an engine may have written the file anew meanwhile.
+            if (
+                not isinstance(record, StoredDecision)
+                or newest.get(record.decision.id, offset) == offset
+            ):
+                yield record
 
     def save_newest_entry(self, newest: EntryName | None) -> None:
         """Write to header and head the newest ledger entry, and which records the store holds.
@@ -414,8 +421,8 @@ class Journal:
 
         With a damaged header the store counts as lacking every record. Records that are damaged or
         missing are described in `loss`, and not raised. An unfinished record at the end is left
-        out. Nothing is written. Raise StoreError if the file is no journal, and
-        OSError if it cannot be read. An empty file is a journal without records.
+        out. Nothing is written. Raise StoreError if the file is no journal, and OSError if it
+        cannot be read. An empty file is a journal without records.
         """
         head = self.head
         fields: dict[str, Any] = {"newest": None, "n_drained": head.n_drained}
@@ -563,13 +570,13 @@ def read_undrained(path: Path) -> tuple[list[Record], Journal]:
     """Return the records of a journal that its store has not taken, and the journal, closed.
 
     The records are those of `Journal.decode_undrained`. Nothing is locked or changed, so an engine
-    may be using the journal. Raise StoreError if the file cannot be opened or
-    is no journal, and for an intact record that cannot be decoded, like that of another release of
-    dengine. If the disk fails later, while the records are read, OSError is raised.
+    may be using the journal. Raise StoreError if the file cannot be opened or is no journal, and
+    for an intact record that cannot be decoded, like that of another release of dengine. If the
+    disk fails later, while the records are read, OSError is raised.
     """
     journal = Journal(path, owning=False)
     try:
-        return journal.decode_undrained(), journal
+        return list(journal.decode_undrained()), journal
     finally:
         journal.close()
 

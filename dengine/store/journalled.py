@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterable
 from concurrent.futures import Future
 from contextlib import suppress
 from dataclasses import replace
+from itertools import islice
 from typing import TYPE_CHECKING, TypeVar
 
 from ..errors import NotTakenError, StoreError, log
@@ -23,7 +24,7 @@ from .journal import HEADER
 from .lookup import DecisionIndex
 from .outbox import Outbox
 from .recording import RETRY_SECONDS, Recorder
-from .records import DATA_LOST, LabelNumbers, NewLabel, StoredDecision, chunks
+from .records import CHUNK, DATA_LOST, LabelNumbers, NewLabel, StoredDecision
 from .views import HistoryFilter
 
 if TYPE_CHECKING:
@@ -121,7 +122,8 @@ class JournalledStore(Outbox):
         since = ""
         for item in self.store.decisions.select(HistoryFilter(), limit=1):
             since = f" They came after decision {item.decision.id} of {item.when:%F %T} UTC."
-        for records in chunks(self._journal.decode_undrained()):
+        undrained = self._journal.decode_undrained()
+        while records := list(islice(undrained, CHUNK)):
             self.store.apply_records(records)
         if self._journal.loss:
             self._drainer.report(DATA_LOST, self._journal.loss + since)

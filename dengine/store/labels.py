@@ -143,7 +143,8 @@ class LabelTable(CellTable):
         `query` must have this limit (None: no limit), order and condition already. In a product it
         is first run on the labels with the 2 * `limit` highest numbers up to `last`, because the
         database would sort all labels of the product otherwise. If these give fewer than `limit`
-        rows, it is run on all labels.
+        rows, it is run on all labels. Rows of all labels are fetched while the caller goes through
+        them, so that must happen within the transaction of `connection`.
         """
         if self._scope.product is not None and limit is not None:
             newest = self._scope.newest(connection, LABEL.c.seq)

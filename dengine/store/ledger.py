@@ -247,9 +247,14 @@ def _settings_text(connection: sa.Connection, cell_id: str) -> str:
 
 
 def parse_object(text: Any) -> dict[str, Any]:
-    """Return the fields of a JSON object that a ledger entry holds; {} if it is damaged or None."""
+    """Return the fields of a JSON object that a ledger entry holds; {} if it is damaged or None.
+
+    `text` is as the driver returned it, so it may be anything. Nothing is raised.
+    """
     with suppress(ValueError, TypeError):
-        return dict(json.loads(text))
+        fields = json.loads(text)
+        if isinstance(fields, dict):
+            return fields
     return {}
 
 

@@ -130,7 +130,7 @@ def list_cells(url: str) -> list[CellSummary]:
 
 
 def _summarize(connection: sa.Connection, cell: Scope) -> CellSummary:
-    """Return the summary of a cell, whose product `cell` names."""
+    """Return the summary of a cell; `cell` also names its product, whose newest version counts."""
     (n_decisions, last_decision), (n_labels, last_label) = (
         connection.execute(
             sa.select(sa.func.count(), sa.func.max(table.c.time)).where(

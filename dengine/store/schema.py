@@ -201,7 +201,10 @@ def read_setting(connection: sa.Connection, cell_id: str, key: str) -> str | Non
 
 
 def insert_settings(connection: sa.Connection, cell_id: str, settings: Mapping[str, str]) -> None:
-    """Insert settings that a cell does not have yet; nothing is committed."""
+    """Insert settings that a cell does not have yet, if any; nothing is committed.
+
+    A setting that the cell has already raises SQLAlchemy's IntegrityError.
+    """
     rows = [{"cell_id": cell_id, "key": key, "value": value} for key, value in settings.items()]
     if rows:
         connection.execute(sa.insert(SETTING), rows)

@@ -287,8 +287,11 @@ class CellCheck:
     def run(self, entries: Sequence[EntryName], loss: str) -> list[HistoryFault]:
         """Read all rows of the cell, and return what is wrong, table by table; [] if nothing is.
 
-        `entries` are the ledger entries that the cell's journal names, and `loss` says what is
-        damaged in the journal, "" if nothing is. Both are compared at the end.
+        The rows of the tables that the ledger chains come first, then the ledger's entries, the
+        settings, events about lost data that nobody has acknowledged, and whether decisions, traces
+        and labels belong together. At the end come the journal, if `loss`, which says what is
+        damaged in it, is not "", and those of `entries`, the ledger entries that the journal names,
+        that the ledger lacks.
 
         Fill `digests`, the digests of the ledger's entries, and `rows`, the number of rows read,
         and call `on_rows` with the number of rows just read. A database error is a fault, too, and
@@ -413,15 +416,16 @@ class CellCheck:
         """Yield a fault for each setting that was changed, or is only in the table or the ledger.
 
         The ledger has a copy of the cell's settings, but not of those that the store itself keeps
-        (`RESERVED`), so a change of these is no fault here. If the setting with the version of the
-        tables is missing (no engine has opened the cell), that is a fault, too.
+        (`RESERVED`), so a change of these is no fault here. A damaged or missing copy counts as
+        empty. If the setting with the version of the tables is missing (no engine has opened the
+        cell), that is a fault, too.
         """
         stored = read_settings(self.connection, self.cell_id)
         is_copy = (LEDGER.c.cell_id == self.cell_id) & LEDGER.c.settings.is_not(None)
         copies = sa.select(LEDGER.c.settings).where(is_copy).order_by(LEDGER.c.number.desc())
         # An entry that was changed is found by the chain.
         chained = parse_object(self.connection.execute(copies.limit(1)).scalar())
-        for key in sorted(stored.keys() | chained.keys()):
+        for key in sorted(stored.keys() | chained.keys(), key=str):  # a damaged key may be bytes
             if key not in chained:
                 yield self._fault(SETTING.name, key, "is not chained")
             elif key not in stored:
@@ -442,8 +446,8 @@ class CellCheck:
     def _check_pairs(self, table: sa.Table, required: sa.Table) -> Iterator[HistoryFault]:
         """Yield a fault for each row of `table` that needs a row in `required` and has none.
 
-        None after an error of the database.
-        The row that is needed has the same decision id. The fault names the table `required`.
+        The row that is needed has the same decision id. The fault names the table `required`. If a
+        table could not be read to its end, nothing is read or yielded.
         """
         if self._is_unreadable:  # everything that could not be read would be missing
             return

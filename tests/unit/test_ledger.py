@@ -122,6 +122,8 @@ def test_a_value_changed_in_any_column_of_any_table_is_found(written, tmp_path):
         ("UPDATE event SET text = 'another' WHERE number = 1", ("event", "1")),
         ("UPDATE setting SET value = 'a = 3' WHERE key = 'recipe'", ("setting", "recipe")),
         ("INSERT INTO setting VALUES ('cell', 'more', 'x')", ("setting", "more")),
+        ("INSERT INTO setting VALUES ('cell', x'ff', 'x')", ("setting", "b'\\xff'")),
+        ("""UPDATE ledger SET added = '[[1, 2], ["a", 3]]'""", ("ledger", "entry 3")),
         ("DELETE FROM label WHERE seq = 4", ("ledger", "entry 15")),
         ("DELETE FROM event WHERE number = 1", ("ledger", "entry 21")),
         ("DELETE FROM model_version WHERE retrain = 3", ("ledger", "entry 19")),
