@@ -112,7 +112,10 @@ def qualify_rows(p: Proposal) -> None:
             continue
         words = tuple(column.counts)
         if len(words) > 1:
-            text = f"which rows are samples? {counts_of(column.counts)}; others drop or invalid"
+            text = (
+                f"which rows are samples? {counts_of(column.counts)}; others drop or invalid; if "
+                "one row has the label, state label.column, and label.at as first or last"
+            )
             p.notes[f"rows.{column.name}.keep"] = text
             words = (UNKNOWN,)
         rows[column.name] = RowWords(words)
