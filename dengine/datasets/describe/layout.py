@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from ...errors import DataError, listed
-from ..description import ANY, UNKNOWN, Channel, LabelSource, TextForm
+from ..description import ANY, UNKNOWN, Channel, TextForm
 from ..read.split import OBJECTS, split
 from ..table import Table
 from . import labels
@@ -114,14 +114,15 @@ def has_lists(table: Table) -> bool:
 def _refuse_results(columns: Iterable[Column]) -> None:
     """Raise DataError for a table of results: a row for each part, with its label, but no samples.
 
-    `columns` are those of a single table. One shows this if it has a known word for good or for
+    `columns` are those of a single table. One shows this if it has known words for good and for
     bad, maybe among other words, and somewhere between two changes one word stands in fewer than 8
     successive rows.
     """
     for column in columns:
         edges = np.flatnonzero(column.words[0][1:] != column.words[0][:-1])
         is_short = min(np.diff(edges), default=LEAST_RUN) < LEAST_RUN
-        if is_short and labels.has_meaning(LabelSource(), column.counts):
+        words = {word.lower() for word in column.counts if is_short}
+        if words.intersection(labels.GOOD) and words.intersection(labels.BAD):
             raise DataError(
                 f"Expected the samples of each part in {column.tables[0].source}, got a row for "
                 f"each result, with its verdict in {column.name}, and no curve; if the rows of "
