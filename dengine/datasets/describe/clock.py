@@ -97,9 +97,10 @@ def form_of(column: Column, p: Proposal, is_alone: bool) -> str:
 
     The form of dates or times of day comes first, then the unit that the file states, the one in
     the column's name, like `ms` of `t [ms]`, `t in 0.1 ms` or `millis`, and what the size of the
-    numbers proves. A note on `time.format` in `p` says why it is `?`. If several forms of dates
-    fit, so that day and month can be confused, the form is `?`; but if another column tells a part
-    of the time, too, and all recordings have one and the same date, it is the first of these forms.
+    numbers proves. A note on `time.format` in `p` says that the size proves it, or why it is `?`.
+    If several forms of dates fit, so that day and month can be confused, the form is `?`; but if
+    another column tells a part of the time, too, and all recordings have one and the same date, it
+    is the first of these forms.
 
     is_alone : whether no other column tells a part of the time.
     """
@@ -120,7 +121,7 @@ def form_of(column: Column, p: Proposal, is_alone: bool) -> str:
 
 
 def _unit_by_size(column: Column, p: Proposal) -> str:
-    """Return the unit of time that the numbers in a column prove; `?`, with a note, if none.
+    """Return the unit of time that the numbers in a column prove, with a note; `?` if none.
 
     A unit is proved if with it the first number is a time in the years 2000 to 2050, counted from
     1970 or from another day that clocks use, and the median of the steps above 0 gives a rate of
@@ -132,11 +133,13 @@ def _unit_by_size(column: Column, p: Proposal) -> str:
     rising = column.steps[column.steps > 0]
     if not len(rising):
         odd = listed([*column.odd][:3])
-        text = f"no form of times that is known fits {odd}: state it, or text.drop"
-        p.notes["time.format"] = text
+        p.notes["time.format"] = (
+            f"no form of times that is known fits {odd}: state it, or text.drop"
+        )
         return UNKNOWN
-    first = float(column.numbers[0][0])
+    first = float(np.concatenate(column.numbers)[0])
     step = float(np.median(rising))
+    p.notes["time.format"] = f"by the size of the numbers, in steps of {step:.6g}; it is not stated"
     for unit, zero in EPOCHS:
         scale = scale_of(unit)
         if YEARS[0] <= first * scale - zero <= YEARS[1] and is_rate(step * scale):

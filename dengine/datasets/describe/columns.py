@@ -70,8 +70,14 @@ class Column:
 
     @cached_property
     def strange(self) -> Counter[str]:
-        """How often each word comes that is no number and does not mean a lost sample (`LOST`)."""
-        return Counter({w: n for w, n in self.odd.items() if w.lower() not in LOST})
+        """How often each word comes that is no number, and neither in `LOST` nor `text.missing`."""
+        return Counter(
+            {
+                word: n
+                for word, n in self.odd.items()
+                if word.lower() not in LOST and word not in self.form.missing
+            }
+        )
 
     @cached_property
     def fixed(self) -> list[str]:
