@@ -235,16 +235,17 @@ def table_in(p: Proposal, content: bytes, name: str) -> Table:
 def propose_tables(p: Proposal, files: Tables) -> None:
     """Find the layout, then what each column is for, and set the keys that say so in `p`.
 
-    A stated layout stays. `files` has the table of each file that is looked at. At most the first
-    50,000 rows of each are used; `p.is_cut` is set if a file has more. `p.tables` becomes the
-    tables of the parts, and `p.names` is emptied unless each file is one part. If the layout or
-    `part.column` is `?`, nothing more is proposed: `p.tables` and `p.names` stay, and a note on
-    `channels` says why. Raises DataError if there is no part, or only a table of results, if the
-    tables do not split as a stated layout says, or if a stated column, setting in `[time]` or
-    source of labels is wrong, and SettingError for a malformed `windows.trigger`.
+    A stated layout stays; if it is `long`, `part.column` is looked for all the same. `files` has
+    the table of each file that is looked at. At most the first 50,000 rows of each are used;
+    `p.is_cut` is set if a file has more. `p.tables` becomes the tables of the parts, and `p.names`
+    is emptied unless each file is one part. If the layout or `part.column` is `?`, nothing more is
+    proposed: `p.tables` and `p.names` stay, and a note on `channels` says why. Raises DataError if
+    there is no part, or only a table of results, if the tables do not split as a stated layout
+    says, or if a stated column, setting in `[time]` or source of labels is wrong, and SettingError
+    for a malformed `windows.trigger`.
     """
     p.is_cut |= any(len(table.lines) > MOST_ROWS for table in files)
-    files = [table.take(slice(0, MOST_ROWS)) for table in files]
+    files = [table.take(slice(MOST_ROWS)) for table in files]
     if "layout" not in p.stated or p.description.layout == "long":
         p.put("layout", layout_of(p, files))
     if UNKNOWN in (p.description.layout, *p.description.part.column):
