@@ -197,9 +197,9 @@ def read_tables(p: Proposal) -> list[Table]:
         if sum(map(len, contents.values())) < MOST_BYTES:
             with caught(faults, name):
                 contents[name] = read_file(p.base / name)
-    is_text = p.description.format == "text"
+    names = propose_form(p, contents, faults) if p.description.format == "text" else contents
     files = list[Table]()
-    for name in propose_form(p, contents, faults) if is_text else contents:
+    for name in names:
         with caught(faults, name):
             files.append(table_in(p, contents[name], name))
     if not files:

@@ -230,16 +230,15 @@ def count_sources(p: Proposal, stated: Sequence[LabelSource]) -> dict[LabelSourc
     `with_meanings` does. Raises DataError if the stated source has no words or cannot be read, and
     SettingError for a malformed `windows.trigger`.
     """
-    read = {table.source for table in p.tables}
-    others = [Table(name, {}, [], path=name) for name in p.names if name not in read]
+    looked_at = {table.source for table in p.tables}
+    others = [Table(name, {}, [], path=name) for name in p.names if name not in looked_at]
     tables = [*p.tables, *others]
     parts = part_words(p.description.part, tables)
     counted = dict[LabelSource, Words]()
     for source in stated or sources_of(p, [table.path for table in tables]):
         words = words_of(p, source, tables, parts)
         is_new = words not in counted.values() or is_named_like_verdict(source)
-        looked_at = tables if source.listing or source.path else p.tables
-        is_common = len(words) > len(looked_at) / 2
+        is_common = 2 * len(words) > len(tables if source.listing or source.path else p.tables)
         if stated or (is_new and is_common and may_be_labels(source, words.values())):
             counted[with_meanings(source, words.values())] = words
     return counted

@@ -33,13 +33,14 @@ def layout_of(p: Proposal, files: Tables) -> str:
     file. It is `long` if a column of the first table may tell the parts apart (`may_tell_parts`),
     or if a file has several words of a stated `part.column`; unless it is stated, `part.column` is
     then set in `p` to the only such column with a name like that of a part's number and no word in
-    two files, or to `?` with a note. Several tables are `files`. A single one gives `?`, with a
-    note on what to state, or DataError if it is a table of results: one row for each part, with its
-    label, and no samples. Raises UnreadableError if cells of columns that are looked at are lists.
+    two files, or to `?` with a note. Several files, of which `p.names` may have more than were
+    looked at, are `files`. A single one gives `?`, with a note on what to state, or DataError if it
+    is a table of results: one row for each part, with its label, and no samples. Raises
+    UnreadableError if cells of columns that are looked at are lists.
     """
     kind = p.description.format
     first = files[0]
-    if kind in OBJECTS and len(files) > 1 and len(first.lines) == 1:
+    if kind in OBJECTS and len(p.names) > 1 and len(first.lines) == 1:
         return "files"
     if numbered_columns(first) or has_lists(first):
         return "npz" if kind == "npz" else "wide"
@@ -49,12 +50,12 @@ def layout_of(p: Proposal, files: Tables) -> str:
     if runs or any(words_in(column) > len(files) for column in stated):
         unique = [name for name in runs if words_in(columns[name]) == len(columns[name].counts)]
         likely = [*filter(PART_NAME.search, unique)]
-        long = [name for name, column in columns.items() if has_long_runs(column)]
-        named = filter(PART_NAME.search, columns)
-        note = f"one of {listed(dict.fromkeys([*named, *long]))}, or several"
+        named = [*filter(PART_NAME.search, columns)]
+        named += [name for name, column in columns.items() if has_long_runs(column)]
+        note = f"one of {listed(dict.fromkeys(named))}, or several"
         p.put("part.column", *(likely if len(likely) == 1 else (UNKNOWN, note)))
         return "long"
-    if len(files) > 1:
+    if len(p.names) > 1:  # of large files only the first one is looked at
         return "files"
     _refuse_results(columns.values())
     p.notes["layout"] = f"columns, a part in each, or long: part.column is of {listed(columns)}"
