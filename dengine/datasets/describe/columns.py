@@ -146,8 +146,8 @@ class Proposal:
     stated : keys that the user gave, with their values. description : the description with all keys
     so far. base : the folder. names : the files of the recordings; empty if a file holds several
     parts. others : the other files in the folder. is_cut : whether only the beginning of some file
-    was read. tables : the recordings that are looked at. columns : their columns by name, without
-    rows that are known to be no samples. notes : a comment by key.
+    was read. tables : the recordings that are looked at, without rows that are known to be no
+    samples. columns : their columns by name. notes : a comment by key.
     """
 
     stated: Stated
