@@ -147,7 +147,7 @@ def likely_endings(names: Names) -> Names:
     endings = sorted({name[-1] for name in words})
     is_grid = n_parts * len(endings) == len(names) and min(n_parts, len(endings)) > 1
     may_be_pieces = len(endings) <= MOST_PIECES and n_parts >= LEAST_PARTS
-    is_numbered = re.search(r"\d", "".join(endings)) is not None
+    is_numbered = re.search(r"\d", "".join(endings))
     is_signal = len(likely) == 1 and is_grid and (may_be_pieces or not is_numbered)
     return [*endings, *likely] if is_signal else likely
 
@@ -197,9 +197,9 @@ def read_tables(p: Proposal) -> list[Table]:
         if sum(map(len, contents.values())) < MOST_BYTES:
             with caught(faults, name):
                 contents[name] = read_file(p.base / name)
-    is_text = p.description.format == "text"
+    names = propose_form(p, contents, faults) if p.description.format == "text" else contents
     files = list[Table]()
-    for name in propose_form(p, contents, faults) if is_text else contents:
+    for name in names:
         with caught(faults, name):
             files.append(table_in(p, contents[name], name))
     if not files:
@@ -213,9 +213,9 @@ def table_in(p: Proposal, content: bytes, name: str) -> Table:
 
     An .npz file is read as one that holds all parts if it is the only file, or the layout `npz` is
     stated; but not if another layout is. Of a text or jsonl file of more than 2 MB only the whole
-    lines of the first 2 MB are read, and `p.is_cut` is set. Lines of a text file with a wrong
-    number of cells are left out. Raises DataError if the file is damaged, or if all its lines have
-    a wrong number of cells.
+    lines of the first 2 MB are read, and `p.is_cut` is set. Raises DataError if the file is
+    damaged, or if a line of a text file has a wrong number of cells; but such lines of the only
+    file are left out, unless all its lines are wrong.
     """
     about = p.description
     if about.format in ("text", "jsonl") and len(content) > MOST_BYTES:
@@ -224,6 +224,8 @@ def table_in(p: Proposal, content: bytes, name: str) -> Table:
         p.is_cut = True
     if about.format == "text":
         table = read_text(content, name, about.text)
+        if len(p.names) > 1:
+            return table.whole()
         is_damaged = np.isin(table.lines, [error.line for error in table.damage])
         return replace(table.take(~is_damaged), damage=[])
     layout = p.stated.get("layout", "npz" if len(p.names) == 1 else "files")
@@ -233,17 +235,18 @@ def table_in(p: Proposal, content: bytes, name: str) -> Table:
 def propose_tables(p: Proposal, files: Tables) -> None:
     """Find the layout, then what each column is for, and set the keys that say so in `p`.
 
-    A stated layout stays. `files` has the table of each file that is looked at. At most the first
-    50,000 rows of each are used; `p.is_cut` is set if a file has more. `p.tables` becomes the
-    tables of the parts, and `p.names` is emptied unless each file is one part. If the layout or
-    `part.column` is `?`, nothing more is proposed: `p.tables` and `p.names` stay, and a note on
-    `channels` says why. Raises DataError if there is no part, or only a table of results, if the
-    tables do not split as a stated layout says, or if a stated column, setting in `[time]` or
-    source of labels is wrong, and SettingError for a malformed `windows.trigger`.
+    A stated layout stays; if it is `long`, `part.column` is looked for all the same. `files` has
+    the table of each file that is looked at. At most the first 50,000 rows of each are used;
+    `p.is_cut` is set if a file has more. `p.tables` becomes the tables of the parts, and `p.names`
+    is emptied unless each file is one part. If the layout or `part.column` is `?`, nothing more is
+    proposed: `p.tables` and `p.names` stay, and a note on `channels` says why. Raises DataError if
+    there is no part, or only a table of results, if the tables do not split as a stated layout
+    says, or if a stated column, setting in `[time]` or source of labels is wrong, and SettingError
+    for a malformed `windows.trigger`.
     """
     p.is_cut |= any(len(table.lines) > MOST_ROWS for table in files)
-    files = [table.take(slice(0, MOST_ROWS)) for table in files]
-    if "layout" not in p.stated:
+    files = [table.take(slice(MOST_ROWS)) for table in files]
+    if "layout" not in p.stated or p.description.layout == "long":
         p.put("layout", layout_of(p, files))
     if UNKNOWN in (p.description.layout, *p.description.part.column):
         p.notes["channels"] = "they follow from layout and part.column"

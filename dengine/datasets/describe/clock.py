@@ -97,9 +97,10 @@ def form_of(column: Column, p: Proposal, is_alone: bool) -> str:
 
     The form of dates or times of day comes first, then the unit that the file states, the one in
     the column's name, like `ms` of `t [ms]`, `t in 0.1 ms` or `millis`, and what the size of the
-    numbers proves. A note on `time.format` in `p` says why it is `?`. If several forms of dates
-    fit, so that day and month can be confused, the form is `?`; but if another column tells a part
-    of the time, too, and all recordings have one and the same date, it is the first of these forms.
+    numbers proves. A note on `time.format` in `p` says why it is `?`, or s by the size alone.
+    If several forms of dates fit, so that day and month can be confused, the form is `?`; but if
+    another column tells a part of the time, too, and all recordings have one and the same date, it
+    is the first of these forms.
 
     is_alone : whether no other column tells a part of the time.
     """
@@ -125,23 +126,25 @@ def _unit_by_size(column: Column, p: Proposal) -> str:
     A unit is proved if with it the first number is a time in the years 2000 to 2050, counted from
     1970 or from another day that clocks use, and the median of the steps above 0 gives a rate of
     1 Hz to 1 MHz; the first in `EPOCHS` counts. If none is, and this step is 0.0002 to 0.019, the
-    unit is s. Otherwise it is `?`, and the note on `time.format` in `p` lists the possible units.
-    It is `?`, too, if the column has no numbers that rise; the note then asks for the form of its
-    cells.
+    unit is s, and a note on `time.format` in `p` says so. Otherwise it is `?`, and the note lists
+    the possible units. It is `?`, too, if the column has no numbers that rise; the note then asks
+    for the form of its cells.
     """
     rising = column.steps[column.steps > 0]
     if not len(rising):
         odd = listed([*column.odd][:3])
-        text = f"no form of times that is known fits {odd}: state it, or text.drop"
-        p.notes["time.format"] = text
+        p.notes["time.format"] = (
+            f"no form of times that is known fits {odd}: state it, or text.drop"
+        )
         return UNKNOWN
-    first = float(column.numbers[0][0])
+    first = float(np.concatenate(column.numbers)[0])
     step = float(np.median(rising))
     for unit, zero in EPOCHS:
         scale = scale_of(unit)
         if YEARS[0] <= first * scale - zero <= YEARS[1] and is_rate(step * scale):
             return unit
     if SECONDS[0] <= step <= SECONDS[1]:
+        p.notes["time.format"] = f"seconds, for steps of {step:.6g}; the unit is not stated"
         return "s"
     steps = {unit: step * UNITS[unit] for unit in ("s", "ms", "us", "ns", "min")}
     rates = ", ".join(f"{unit} ({1 / s:.6g} Hz)" for unit, s in steps.items() if is_rate(s))

@@ -70,8 +70,14 @@ class Column:
 
     @cached_property
     def strange(self) -> Counter[str]:
-        """How often each word comes that is no number and does not mean a lost sample (`LOST`)."""
-        return Counter({w: n for w, n in self.odd.items() if w.lower() not in LOST})
+        """How often each word comes that is no number, and neither in `LOST` nor `text.missing`."""
+        return Counter(
+            {
+                word: n
+                for word, n in self.odd.items()
+                if word.lower() not in LOST and word not in self.form.missing
+            }
+        )
 
     @cached_property
     def fixed(self) -> list[str]:
@@ -140,8 +146,8 @@ class Proposal:
     stated : keys that the user gave, with their values. description : the description with all keys
     so far. base : the folder. names : the files of the recordings; empty if a file holds several
     parts. others : the other files in the folder. is_cut : whether only the beginning of some file
-    was read. tables : the recordings that are looked at. columns : their columns by name, without
-    rows that are known to be no samples. notes : a comment by key.
+    was read. tables : the recordings that are looked at, without rows that are known to be no
+    samples. columns : their columns by name. notes : a comment by key.
     """
 
     stated: Stated

@@ -59,10 +59,7 @@ PLACES = (  # of any words: folders, and the words of a file's name, counted fro
     "([^-_ /]+)(?:[-_ ][^-_ /]*){3}$",
     "(?:^|/)([^-_ /]+)[^/]*$",
 )
-NO_LABEL = (
-    "none was found that is certain: state label.column, path, line or listing; label.at is `last` "
-    "if only the last row has the label"
-)
+NO_LABEL = "none was found that is certain: state label.column, path, line or listing"
 Names = Iterable[str]
 Words = Mapping[str, str]  # by recording
 Meanings = Mapping[str, int | None]  # by recording: 1 good, 0 bad, None unchecked
@@ -226,12 +223,12 @@ def count_sources(p: Proposal, stated: Sequence[LabelSource]) -> dict[LabelSourc
     """Return the possible sources of labels, each with the words that it has, by recording.
 
     If the user stated a source, only that one is returned. Otherwise these are the sources that
-    have few different words (`may_be_labels`), and more of them than half of `p.tables`. A source
-    with the same words as an earlier one counts only if it is named like a verdict. For listings
-    and paths all recordings count, since their names are enough; for columns and lines only those
-    whose tables were read. The words are sorted into good, bad and unchecked as `with_meanings`
-    does. Raises DataError if the stated source has no words or cannot be read, and SettingError for
-    a malformed `windows.trigger`.
+    have few different words (`may_be_labels`), and a word for more than half of the recordings. A
+    source with the same words as an earlier one counts only if it is named like a verdict. For
+    listings and paths all recordings count, since their names are enough; for columns and lines
+    only those whose tables were read. The words are sorted into good, bad and unchecked as
+    `with_meanings` does. Raises DataError if the stated source has no words or cannot be read, and
+    SettingError for a malformed `windows.trigger`.
     """
     looked_at = {table.source for table in p.tables}
     others = [Table(name, {}, [], path=name) for name in p.names if name not in looked_at]
@@ -241,7 +238,7 @@ def count_sources(p: Proposal, stated: Sequence[LabelSource]) -> dict[LabelSourc
     for source in stated or sources_of(p, [table.path for table in tables]):
         words = words_of(p, source, tables, parts)
         is_new = words not in counted.values() or is_named_like_verdict(source)
-        is_common = len(words) > len(p.tables) / 2
+        is_common = 2 * len(words) > len(tables if source.listing or source.path else p.tables)
         if stated or (is_new and is_common and may_be_labels(source, words.values())):
             counted[with_meanings(source, words.values())] = words
     return counted

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from ...errors import DataError, listed
-from ..description import ANY, UNKNOWN, Channel, LabelSource, TextForm
+from ..description import ANY, UNKNOWN, Channel, TextForm
 from ..read.split import OBJECTS, split
 from ..table import Table
 from . import labels
@@ -33,13 +33,14 @@ def layout_of(p: Proposal, files: Tables) -> str:
     file. It is `long` if a column of the first table may tell the parts apart (`may_tell_parts`),
     or if a file has several words of a stated `part.column`; unless it is stated, `part.column` is
     then set in `p` to the only such column with a name like that of a part's number and no word in
-    two files, or to `?` with a note. Several tables are `files`. A single one gives `?`, with a
-    note on what to state, or DataError if it is a table of results: one row for each part, with its
-    label, and no samples. Raises UnreadableError if cells of columns that are looked at are lists.
+    two files, or to `?` with a note. Several files, of which `p.names` may have more than were
+    looked at, are `files`. A single one gives `?`, with a note on what to state, or DataError if it
+    is a table of results: one row for each part, with its label, and no samples. Raises
+    UnreadableError if cells of columns that are looked at are lists.
     """
     kind = p.description.format
     first = files[0]
-    if kind in OBJECTS and len(files) > 1 and len(first.lines) == 1:
+    if kind in OBJECTS and len(p.names) > 1 and len(first.lines) == 1:
         return "files"
     if numbered_columns(first) or has_lists(first):
         return "npz" if kind == "npz" else "wide"
@@ -49,12 +50,12 @@ def layout_of(p: Proposal, files: Tables) -> str:
     if runs or any(words_in(column) > len(files) for column in stated):
         unique = [name for name in runs if words_in(columns[name]) == len(columns[name].counts)]
         likely = [*filter(PART_NAME.search, unique)]
-        long = [name for name, column in columns.items() if has_long_runs(column)]
-        named = filter(PART_NAME.search, columns)
-        note = f"one of {listed(dict.fromkeys([*named, *long]))}, or several"
+        named = [*filter(PART_NAME.search, columns)]
+        named += [name for name, column in columns.items() if has_long_runs(column)]
+        note = f"one of {listed(dict.fromkeys(named))}, or several"
         p.put("part.column", *(likely if len(likely) == 1 else (UNKNOWN, note)))
         return "long"
-    if len(files) > 1:
+    if len(p.names) > 1:  # of large files only the first one is looked at
         return "files"
     _refuse_results(columns.values())
     p.notes["layout"] = f"columns, a part in each, or long: part.column is of {listed(columns)}"
@@ -114,14 +115,15 @@ def has_lists(table: Table) -> bool:
 def _refuse_results(columns: Iterable[Column]) -> None:
     """Raise DataError for a table of results: a row for each part, with its label, but no samples.
 
-    `columns` are those of a single table. One shows this if it has a known word for good or for
+    `columns` are those of a single table. One shows this if it has known words for good and for
     bad, maybe among other words, and somewhere between two changes one word stands in fewer than 8
     successive rows.
     """
     for column in columns:
         edges = np.flatnonzero(column.words[0][1:] != column.words[0][:-1])
         is_short = min(np.diff(edges), default=LEAST_RUN) < LEAST_RUN
-        if is_short and labels.has_meaning(LabelSource(), column.counts):
+        words = {word.lower() for word in column.counts if is_short}
+        if words.intersection(labels.GOOD) and words.intersection(labels.BAD):
             raise DataError(
                 f"Expected the samples of each part in {column.tables[0].source}, got a row for "
                 f"each result, with its verdict in {column.name}, and no curve; if the rows of "

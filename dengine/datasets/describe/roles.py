@@ -45,9 +45,9 @@ def propose_roles(p: Proposal) -> None:
     is open which rows are samples, `traces.samples` is `?` and no rate is set; a clock with `?`
     gives no rate either. Stated keys stay, but a stated `ignored` is replaced (`list_others`), and
     a stated `[rows]` gets further columns and words (`qualify_rows`, `find_lost`). `p.columns` is
-    set. Raises DataError if a stated column of times or channel does not exist, a setting in
-    `[time]` is wrong, or a stated source of labels has no words or cannot be read, and SettingError
-    for a malformed `windows.trigger`.
+    set, and `p.tables` loses rows that are no samples. Raises DataError if a stated column of times
+    or channel does not exist, a setting in `[time]` is wrong, or a stated source of labels has no
+    words or cannot be read, and SettingError for a malformed `windows.trigger`.
     """
     p.columns = columns_of(p.tables, p.description.text)
     for name in (*p.description.time.column, *p.description.channels):
@@ -93,10 +93,10 @@ def qualify_rows(p: Proposal) -> None:
 
     Such a column has few words, and they change within a recording (`qualifies`). If it has
     several, its `keep` is `?`, with a note that counts them; if it has one, that becomes its
-    `keep`. If the user stated some words of a column, its other words are added to
-    `keep`, or to `drop` if `keep` is stated: as `*` if they are more than 12, and not if `*` is
-    stated. Rows that are then known to be no samples are left out of `p.columns`. Raises
-    SettingError for a malformed `windows.trigger`.
+    `keep`. If the user stated some words of a column, its other words are added to `keep`, or to
+    `drop` if `keep` is stated: as `*` if they are more than 12, and not if `*` is stated. Rows that
+    are then known to be no samples are left out of `p.tables` and `p.columns`. Raises SettingError
+    for a malformed `windows.trigger`.
     """
     rows = dict(p.description.rows)
     for name in rows.keys() & p.columns.keys():
@@ -112,7 +112,10 @@ def qualify_rows(p: Proposal) -> None:
             continue
         words = tuple(column.counts)
         if len(words) > 1:
-            text = f"which rows are samples? {counts_of(column.counts)}; others drop or invalid"
+            text = (
+                f"which rows are samples? {counts_of(column.counts)}; others drop or invalid; if "
+                "one row has the label, state label.column, and label.at as first or last"
+            )
             p.notes[f"rows.{column.name}.keep"] = text
             words = (UNKNOWN,)
         rows[column.name] = RowWords(words)
@@ -224,8 +227,8 @@ def find_lost(p: Proposal) -> None:
     any case of letters. If another text is in more than 1 % of a channel's cells, `text.missing` is
     `?`, with a note. If more than 10 % of the cells of a channel are empty, "" is not added for it
     if `time.column` is set, even to `?`: these rows belong to another signal. `[rows]` then drops
-    them, unless it has words of this channel already; dropped rows are left out of `p.columns`. A
-    stated `text.missing` stays, but `[rows]` changes all the same.
+    them, unless it has words of this channel already; dropped rows are left out of `p.tables` and
+    `p.columns`. A stated `text.missing` stays, but `[rows]` changes all the same.
     """
     rows = dict(p.description.rows)
     missing = {*p.description.text.missing}

@@ -215,10 +215,10 @@ def _split_columns(table: Table, description: Description) -> Iterator[Table]:
                 source=f"{table.source}, column {column}",
                 path=column,
                 columns={**beside, channel: samples},
-                units={channel: table.units.get(column, "")},
+                units={**table.units, channel: table.units.get(column, "")},
                 origin={channel: [column] * len(samples)},
             )
-            yield part.take(slice(0, len(samples)))
+            yield part.take(slice(len(samples)))
 
 
 def without_empty_end(cells: Cells) -> Cells:

@@ -116,5 +116,5 @@ def _listed(table: Table, times: Floats, description: Description, base: Path) -
         elif not len(rows) or begin < times[0] - margin or end > times[-1] + margin:
             fault = "Expected samples in the whole window, it has none or goes beyond the recording"
         latest = max(latest, end)
-        window = slice(rows[0], rows[-1] + 1) if len(rows) else slice(0, 1)
+        window = slice(rows[0], rows[-1] + 1) if len(rows) else slice(1)
         yield key, window, fault
