@@ -27,6 +27,7 @@ from ..read.text import read_text
 from ..table import Table
 from .bags import propose_bag
 from .columns import Proposal, Stated, Tables
+from .labels import WORD
 from .layout import layout_of, parts_of
 from .roles import propose_roles
 from .text_form import MOST_BYTES, decode, propose_form
@@ -137,8 +138,9 @@ def likely_endings(names: Names) -> Names:
     They are the suffixes that several files have, and `.mcap` if one file has it; or else all. If
     there is only one, the endings that tell signals apart come before it: `Kraft.csv` of
     `1_Kraft.csv`, the last word with its suffix, behind the part. There must be two parts and two
-    such endings or more, and each part must have a file with each ending. Endings with digits count
-    only if there are 2 to 4 of them and 10 parts or more: numbered pieces of a part's curve.
+    such endings or more, and each part must have a file with each ending. An ending that is a word
+    like `ok` or `pending` tells no signal. Endings with digits count only if there are 2 to 4 of
+    them and 10 parts or more: numbered pieces of a part's curve.
     """
     counts = Counter(map(suffix_of, names))
     likely = [suffix for suffix, n in counts.items() if n > 1 or suffix == BAG] or [*counts]
@@ -147,8 +149,11 @@ def likely_endings(names: Names) -> Names:
     endings = sorted({name[-1] for name in words})
     is_grid = n_parts * len(endings) == len(names) and min(n_parts, len(endings)) > 1
     may_be_pieces = len(endings) <= MOST_PIECES and n_parts >= LEAST_PARTS
-    is_numbered = re.search(r"\d", "".join(endings))
-    is_signal = len(likely) == 1 and is_grid and (may_be_pieces or not is_numbered)
+    text = " ".join(endings)
+    is_other = re.search(rf"(?i)\b({WORD})\.", text) or (
+        re.search(r"\d", text) and not may_be_pieces
+    )
+    is_signal = len(likely) == 1 and is_grid and not is_other
     return [*endings, *likely] if is_signal else likely
 
 
