@@ -59,6 +59,7 @@ from .exclusive import ExclusiveUse
 from .feedback import Feedback, Remedy
 from .fleet import Peers
 from .garbage import frozen_objects, uncollected
+from .guard import NOT_PRECOMPUTED, guarded
 from .learner import Learner
 from .live_model import LiveModel
 from .settings import (
@@ -275,9 +276,9 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         stored traces, which a retrain would compute first, are computed. If there are labels and no
         version yet, this call begins to compute them, and also has the code for decisions compiled
         if the model can be compiled; in other cases `Learner.resume` began to. There is no time
-        limit; if the computation fails, that is logged, and nothing is raised.
+        limit; if loading or computing fails, that is logged, and nothing is raised.
         """
-        self._live.template.warm_up()
+        guarded(NOT_PRECOMPUTED, self._live.template.warm_up)
         if self.state.new_labels and not self.version:
             self._learner.precompute()
         self._learner.wait_until_precomputed()
@@ -753,7 +754,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         self._outbox.check_usable()
         with self._exclusive:
             if wait:
-                self._live.template.warm_up()  # its time is no part of the retrain's
+                # Its time is no part of the retrain's.
+                guarded(NOT_PRECOMPUTED, self._live.template.warm_up)
                 self._learner.end_training()  # what it would give lacks the newest labels
             else:
                 self._learner.advance()

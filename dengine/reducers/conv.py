@@ -248,12 +248,14 @@ class ConvReducer(TorchReducer):
         return average_logits(torch.from_numpy(points), torch.from_numpy(probabilities)).numpy()
 
     def embed(self, X: Floats) -> Floats:
-        """Embed traces (n, C, T) in every space; return float32 (n, K, d).
+        """Embed traces (n, T) or (n, C, T) in every space; return float32 (n, K, d).
 
         The logit of the first coordinate is the mean of those of the network and of `rocket_`.
+        Raises as `TorchReducer.embed` does.
         """
-        points = torch.from_numpy(super().embed(X))
-        return average_logits(points, torch.from_numpy(self.rocket_.embed(X))).numpy()
+        traces = self.check_traces(X)  # once, since `rocket_` knows no names of columns
+        points = torch.from_numpy(super().embed(traces))
+        return average_logits(points, torch.from_numpy(self.rocket_.embed(traces))).numpy()
 
     def module(self) -> ConvEncoder:
         check_is_fitted(self, "encoder_")
