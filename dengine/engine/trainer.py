@@ -132,6 +132,11 @@ class TrainingWindow:
         return int(numbers[i]), traces[i], int(labels[i]), int(hashes[i])
 
 
+def _no_numbers() -> Ints:
+    """Return the numbers of no labels: an empty array."""
+    return np.zeros(0, dtype=np.int64)
+
+
 @dataclass(frozen=True)
 class TrainedOn:
     """The labels that a version was trained on; by default none, before the first version.
@@ -149,7 +154,7 @@ class TrainedOn:
         retrain replaces; 0: the version is not pinned.
     """
 
-    seq: Ints = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    seq: Ints = field(default_factory=_no_numbers)
     corrected_to: int = 0
     counts_from: int = 0
     pinned: int = 0
@@ -210,7 +215,7 @@ class Trained:
     seconds: float = 0.0
     last_seconds: float = 0.0
     begin: float = 0.0
-    seq: Ints = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    seq: Ints = field(default_factory=_no_numbers)
 
 
 @runtime_checkable
@@ -267,7 +272,7 @@ class Retrainer:
         self.future: Future[Trained] | None = None
         self._discarded: Future[Trained] | None = None  # may be at work; the next one waits for it
         self._began = 0.0  # when the executor could begin with the training, by `time.monotonic`
-        self._seq = np.zeros(0, dtype=np.int64)  # the labels that it was given
+        self._seq = _no_numbers()  # of the labels that it was given
         self._last_seconds = deque([0.0], N_REMEMBERED)  # of the newest trainings
 
     def _step_seconds(self) -> float | None:
@@ -334,10 +339,12 @@ class Retrainer:
         training begins when it is done.
         """
         future = self.future
+        if future is None:
+            return False
         self.future = None
-        if future is not None and not future.cancel():
+        if not future.cancel():
             self._discarded = future
-        return future is not None
+        return True
 
     @property
     def is_done(self) -> bool:
