@@ -185,10 +185,11 @@ class Learner:
         begins.
 
         With `wait` True, or if no executor takes work (none is there, or it died or hangs), all is
-        done in this thread, which then has one torch thread, and the report is returned. Otherwise None is returned, and `advance` puts
-        the version in force later. With `wait` False, None is also returned if a training is under
-        way already, and then nothing is begun. If there is an executor, and the computing in
-        advance is not done, the training is requested, and `retrain_if_due` begins it later.
+        done in this thread, which then has one torch thread, and the report is returned. Otherwise
+        None is returned, and `advance` puts the version in force later. With `wait` False, None is
+        also returned if a training is under way already, and then nothing is begun. If there is an
+        executor, and the computing in advance is not done, the training is requested, and
+        `retrain_if_due` begins it later.
 
         A version that fails or cannot be stored is dropped, and the report says so. If the version
         is stored, but labels that came since cannot be, it is put in force by a later call; its
