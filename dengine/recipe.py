@@ -221,7 +221,7 @@ class Recipe:
         name = str(recipe)
         if name in RECIPES:
             return RECIPES[name]
-        text = _read_text(Path(name))
+        text = _read_text(Path(recipe))
         if text is not None:
             return cls.from_toml(text, where=name)
         if CLASS_PATH.fullmatch(name):

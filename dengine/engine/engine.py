@@ -59,6 +59,7 @@ from .exclusive import ExclusiveUse
 from .feedback import Feedback, Remedy
 from .fleet import Peers
 from .garbage import frozen_objects, uncollected
+from .guard import NOT_PRECOMPUTED, guarded
 from .learner import Learner
 from .live_model import LiveModel
 from .settings import (
@@ -218,9 +219,9 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         `template` is the untrained model, and the arguments from `executor` to `on_safe_mode` are
         those of `DataEngine`. From now on the store is closed when the engine is garbage-collected.
         Without an executor, and unless the engine only reads (`reading`), the modules that a
-        retrain imports are loaded. Limits this thread to one torch thread. Raises SettingError for
-        force limits in seconds at an unknown rate, and StoreError if another engine owns the cell
-        or the store cannot be used.
+        retrain imports are loaded; what that raises, for a reducer of the user's, is raised. Limits
+        this thread to one torch thread. Raises SettingError for force limits in seconds at an
+        unknown rate, and StoreError if another engine owns the cell or the store cannot be used.
         """
         recipe = settings.recipe
         check_rate(recipe.policy.force_limits, settings.trace)
@@ -275,9 +276,9 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         stored traces, which a retrain would compute first, are computed. If there are labels and no
         version yet, this call begins to compute them, and also has the code for decisions compiled
         if the model can be compiled; in other cases `Learner.resume` began to. There is no time
-        limit; if the computation fails, that is logged, and nothing is raised.
+        limit; if loading or computing fails, that is logged, and nothing is raised.
         """
-        self._live.template.warm_up()
+        guarded(NOT_PRECOMPUTED, self._live.template.warm_up)
         if self.state.new_labels and not self.version:
             self._learner.precompute()
         self._learner.wait_until_precomputed()
@@ -738,10 +739,10 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         wait : bool, default True
             True: a version that is already trained is first put in force or dropped, and a training
             that is not done is discarded. With an executor the first such call also loads the
-            modules that a retrain imports. False: begin to retrain in the executor, and
-            return None. If a retrain is under way, nothing is begun; if the executor cannot begin
-            yet, `poll` or `report` begins it. `poll` brings it to its end. Without an executor it
-            runs in this thread, and its report is returned.
+            modules that a retrain imports; if that fails, it is logged. False: begin to retrain in
+            the executor, and return None. If a retrain is under way, nothing is begun; if the
+            executor cannot begin yet, `poll` or `report` begins it. `poll` brings it to its end.
+            Without an executor it runs in this thread, and its report is returned.
 
         Returns
         -------
@@ -753,7 +754,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         self._outbox.check_usable()
         with self._exclusive:
             if wait:
-                self._live.template.warm_up()  # its time is no part of the retrain's
+                # Its time is no part of the retrain's.
+                guarded(NOT_PRECOMPUTED, self._live.template.warm_up)
                 self._learner.end_training()  # what it would give lacks the newest labels
             else:
                 self._learner.advance()
@@ -773,10 +775,10 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         Parameters
         ----------
         brief : bool, default False
-            True: if the executor has trained a version, take it only one step further, in a few
-            milliseconds. False: take it through all steps, until it is in force or is dropped. In a
-            cell of a product, whose cells share labels and versions, it is always taken through all
-            steps.
+            True: if the executor has trained a version, take it only one step further; the longest
+            step, the test, takes some tens of milliseconds. False: take it through all steps, until
+            it is in force or is dropped. In a cell of a product, whose cells share labels and
+            versions, it is always taken through all steps.
 
         Returns
         -------

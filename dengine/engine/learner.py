@@ -95,8 +95,7 @@ class Learner:
         after which a check without a report is overdue, and `policy_since` the first version under
         the policy in force. If there is a version, or at least IMPORTED labels (500), this also
         starts a thread that computes in advance for the next retrain (`precompute`). Raises
-        StoreError if the store cannot be read, and the
-        other errors of `LiveModel.resume`.
+        StoreError if the store cannot be read, and the other errors of `LiveModel.resume`.
         """
         version = self._store.versions.newest()
         reports = self._store.versions.retrains()
@@ -185,11 +184,12 @@ class Learner:
         change what the training starts from. Then new labels count from zero, and the training
         begins.
 
-        With `wait` True, or if no executor takes work, all is done in this thread, which then has
-        one torch thread, and the report is returned. Otherwise None is returned, and `advance` puts
-        the version in force later. With `wait` False, None is also returned if a training is under
-        way already, and then nothing is begun. If there is an executor, and the computing in
-        advance is not done, the training is requested, and `retrain_if_due` begins it later.
+        With `wait` True, or if no executor takes work (none is there, or it died or hangs), all is
+        done in this thread, which then has one torch thread, and the report is returned. Otherwise
+        None is returned, and `advance` puts the version in force later. With `wait` False, None is
+        also returned if a training is under way already, and then nothing is begun. If there is an
+        executor, and the computing in advance is not done, the training is requested, and
+        `retrain_if_due` begins it later.
 
         A version that fails or cannot be stored is dropped, and the report says so. If the version
         is stored, but labels that came since cannot be, it is put in force by a later call; its

@@ -132,6 +132,11 @@ class TrainingWindow:
         return int(numbers[i]), traces[i], int(labels[i]), int(hashes[i])
 
 
+def _no_numbers() -> Ints:
+    """Return the numbers of no labels: an empty array."""
+    return np.zeros(0, dtype=np.int64)
+
+
 @dataclass(frozen=True)
 class TrainedOn:
     """The labels that a version was trained on; by default none, before the first version.
@@ -149,7 +154,7 @@ class TrainedOn:
         retrain replaces; 0: the version is not pinned.
     """
 
-    seq: Ints = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    seq: Ints = field(default_factory=_no_numbers)
     corrected_to: int = 0
     counts_from: int = 0
     pinned: int = 0
@@ -210,7 +215,7 @@ class Trained:
     seconds: float = 0.0
     last_seconds: float = 0.0
     begin: float = 0.0
-    seq: Ints = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    seq: Ints = field(default_factory=_no_numbers)
 
 
 @runtime_checkable
@@ -241,7 +246,7 @@ class Retrainer:
         Optimiser steps of a retrain; None: no limit.
     executor : concurrent.futures.Executor or None
         A `RestartableExecutor` that died or hangs is started again. Any other one is set to None
-        when it died, hangs or takes no more work.
+        when it died or takes no more work; one that hangs is used again when it is free.
     clock : callable
         Seconds, of any origin; it must pickle for a process executor.
 
@@ -265,8 +270,9 @@ class Retrainer:
         self.executor = executor
         self.clock = clock
         self.future: Future[Trained] | None = None
+        self._discarded: Future[Trained] | None = None  # may be at work; the next one waits for it
         self._began = 0.0  # when the executor could begin with the training, by `time.monotonic`
-        self._seq = np.zeros(0, dtype=np.int64)  # the labels that it was given
+        self._seq = _no_numbers()  # of the labels that it was given
         self._last_seconds = deque([0.0], N_REMEMBERED)  # of the newest trainings
 
     def _step_seconds(self) -> float | None:
@@ -300,12 +306,17 @@ class Retrainer:
         """Begin to train a successor of the current model in the executor, on the present window.
 
         A successor starts from the weights of the current model, or from scratch. `collect` returns
-        the outcome; no other training may be under way. It waits until the executor is done with a
-        discarded one. Returns False, and begins nothing, if there is no executor, or if it refuses
-        work. An executor that refuses work is started again or given up, and that is logged.
+        the outcome; no other training may be under way. The training waits in the executor until a
+        discarded one is done. Returns False, and begins nothing, if there is no executor, or if it
+        refuses work, or hangs with a discarded training. An executor that refuses work or hangs is
+        started again if it can be, and otherwise one that refuses work is given up; both are
+        logged.
         """
         executor = self.executor
         if executor is None:
+            return False
+        if self._count_seconds_left() <= 0.0 and self._discarded is not None:
+            self._replace_executor()
             return False
         data = self.window.snapshot()
         if not self._began:
@@ -328,10 +339,12 @@ class Retrainer:
         training begins when it is done.
         """
         future = self.future
+        if future is None:
+            return False
         self.future = None
-        if future is not None:
-            future.cancel()
-        return future is not None
+        if not future.cancel():
+            self._discarded = future
+        return True
 
     @property
     def is_done(self) -> bool:
@@ -342,11 +355,16 @@ class Retrainer:
         """Return how many seconds the executor's training has left, before it counts as hung.
 
         It has HUNG seconds (60) from when the executor could begin with it: while the executor's
-        process still imports modules, the count starts anew. The number is negative after that.
+        process still imports modules, and when a discarded training is done, the count starts anew.
+        The number is negative after that. A training that waits for a discarded one that hangs
+        counts as hung, too.
         """
         now = time.monotonic()
         executor = self.executor
         if isinstance(executor, RestartableExecutor) and not executor.ready.done():
+            self._began = now
+        if self._discarded is not None and self._discarded.done():
+            self._discarded = None
             self._began = now
         return self._began + HUNG - now
 
@@ -387,7 +405,7 @@ class Retrainer:
             return f"dropped: {reason_of(error)}"
         failure = f"{type(error).__name__}: {error}"
         if not is_broken:
-            future.cancel()
+            self.discard()
             seconds = time.monotonic() - self._began
             failure = f"not done after {seconds:.0f} s in the executor."
         if is_broken or self._count_seconds_left() <= 0.0:
@@ -398,7 +416,8 @@ class Retrainer:
         """Start a `RestartableExecutor` again; go on without any other executor.
 
         A restart ends what it works on. If it raises OSError, that is logged, and the next retrain
-        tries again. Any other executor is set to None, which is logged.
+        tries again. Any other executor is set to None, which is logged; but if it still works on a
+        discarded training, it is kept, and used again once that is done.
         """
         executor = self.executor
         if isinstance(executor, RestartableExecutor):
@@ -406,7 +425,7 @@ class Retrainer:
                 executor.restart()
             except OSError:
                 log.exception("retrains are in line until their process can be started again")
-        else:
+        elif self._discarded is None:
             self.executor = None
             log.error("retrains are in line from now on")
 

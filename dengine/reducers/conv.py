@@ -213,9 +213,9 @@ class ConvReducer(TorchReducer):
         """Build `rocket_`, preprocessor and networks for traces of this shape.
 
         It does what `TorchReducer._build` does, after making `rocket_`, a `RocketReducer` that is
-        not initialised yet. The networks have initial weights. `average` is
-        the number of samples that are averaged to one. Without `seed` the seed of the networks
-        comes from `random_state`. Raises SettingError as `TorchReducer._build` does.
+        not initialised yet. The networks have initial weights. `average` is the number of samples
+        that are averaged to one. Without `seed` the seed of the networks comes from `random_state`.
+        Raises SettingError as `TorchReducer._build` does.
         """
         # Before `encoder_`, by which other threads see that there is a module.
         self.rocket_ = RocketReducer(
@@ -248,12 +248,14 @@ class ConvReducer(TorchReducer):
         return average_logits(torch.from_numpy(points), torch.from_numpy(probabilities)).numpy()
 
     def embed(self, X: Floats) -> Floats:
-        """Embed traces (n, C, T) in every space; return float32 (n, K, d).
+        """Embed traces (n, T) or (n, C, T) in every space; return float32 (n, K, d).
 
         The logit of the first coordinate is the mean of those of the network and of `rocket_`.
+        Raises as `TorchReducer.embed` does.
         """
-        points = torch.from_numpy(super().embed(X))
-        return average_logits(points, torch.from_numpy(self.rocket_.embed(X))).numpy()
+        traces = self.check_traces(X)  # once, since `rocket_` knows no names of columns
+        points = torch.from_numpy(super().embed(traces))
+        return average_logits(points, torch.from_numpy(self.rocket_.embed(traces))).numpy()
 
     def module(self) -> ConvEncoder:
         check_is_fitted(self, "encoder_")

@@ -3,9 +3,10 @@
 import subprocess
 import sys
 from collections import Counter
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from threading import Event
+from time import sleep
 from unittest.mock import Mock
 
 import numpy as np
@@ -20,6 +21,7 @@ from dengine import (
     Source,
     TraceSpec,
 )
+from dengine.engine import trainer
 from dengine.errors import SettingError, StoreError
 from dengine.reducers import ConvReducer
 from dengine.store import SqlStore
@@ -253,6 +255,21 @@ def test_a_retrain_leaves_the_time_that_the_last_one_needed_after_its_steps(data
     first, second = engine.retrain(), engine.retrain()
     assert first.seconds > 0.45 >= second.seconds
     assert second.n_steps == first.n_steps - 4
+
+
+def test_a_training_counts_as_hung_only_from_when_a_discarded_one_is_done(monkeypatch):
+    monkeypatch.setattr(trainer, "HUNG", 0.05)
+    discarded, waiting = Future(), Future()
+    executor = Mock(submit=Mock(side_effect=[discarded, waiting]))
+    retrainer = trainer.Retrainer(trainer.TrainingWindow(10), None, None, executor)
+    assert retrainer.start(Mock())
+    discarded.set_running_or_notify_cancel()
+    assert retrainer.discard()
+    assert retrainer.start(Mock())
+    sleep(0.1)
+    discarded.set_result(None)
+    assert retrainer.collect() is None
+    assert retrainer.future is waiting
 
 
 @pytest.mark.slow
