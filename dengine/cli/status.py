@@ -177,11 +177,12 @@ def _error_cell(estimate: "ErrorEstimate") -> str:
     """Return a text on a share of wrong decisions: counts, interval, verdict.
 
     The verdict says whether the share keeps to the tolerance, is beyond it, or may be beyond it
-    (open). Without known outcomes the counts are left out. If the verdict is open as well, the text
-    only says that nothing is known. The interval is rounded outward to 0.1 %. `estimate` has the
-    interval, and the outcomes that it is computed from.
+    (open). Without known outcomes the counts are left out. If the interval then begins at 0 (no
+    line stop is known either) and the verdict is open, the text only says that nothing is known.
+    The interval is rounded outward to 0.1 %. `estimate` has the interval, and the outcomes that it
+    is computed from.
     """
-    if not estimate.n_known and estimate.verdict == "open":
+    if not estimate.n_known and not estimate.lower and estimate.verdict == "open":
         return "none is known"
     basis = ""
     if estimate.n_known:

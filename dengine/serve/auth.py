@@ -234,11 +234,14 @@ class Guard:
         self.tokens = tokens
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Pass an allowed HTTP request on to the application, or answer it with the refusal.
+        """Pass an allowed request on to the application, or answer it with the refusal.
 
-        The size of an allowed request's body is limited while the application reads it, by
-        `_limit_body`.
+        What is no HTTP request, like the application's start and end, passes unchecked. The size
+        of an allowed request's body is limited while the application reads it, by `_limit_body`.
         """
+        if scope["type"] != "http":
+            await self.app(scope, receive, send)
+            return
         try:
             self._check(scope)
         except HTTPException as refusal:
