@@ -4,7 +4,6 @@ robot cell, one of them broken, for `dengine data --sample`.
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
 from ..files import FilePath, new_folder
 from .loading import load_dataset
@@ -37,22 +36,14 @@ def write_sample(folder: FilePath, n: int = 200) -> None:
     data = load_dataset("insertion")
     with new_folder(folder) as target:
         for i, row in enumerate(rng.permutation(len(data))[:n], 1):
-            frame = record(data.X[row], rng)
-            frame["Timestamp"] += 1000.0 + CYCLE_SECONDS * i
+            rows = int(rng.integers(960, 1001))
+            frame = pd.DataFrame(
+                {
+                    "Timestamp": np.arange(rows) / RATE_HZ + (1000.0 + CYCLE_SECONDS * i),
+                    "FZ_Base": data.X[row, :rows],
+                    "TCP_Z": rng.normal(0.0, 2e-5, rows),  # the noise of a robot that stands still
+                }
+            )
             text = frame.to_csv(index=False, float_format="%.7g")
             path = target / f"insertion_{i:04d}_{bool(data.y[row])}.csv"
             path.write_text(text[:-16] if i == min(BROKEN, n) else text, encoding="utf-8")
-
-
-def record(force: NDArray[np.float32], rng: np.random.Generator) -> pd.DataFrame:
-    """Return the first 960 to 1000 samples of an insertion as a table that a cell would record.
-
-    A DataFrame with the columns Timestamp, in seconds from 0 at 500 Hz, FZ_Base, the beginning of
-    `force`, shape (T,) with T of 1000 or more, and TCP_Z, the height, which is only noise. `rng`
-    gives the number and the noise.
-    """
-    n = int(rng.integers(960, 1001))
-    height = rng.normal(0.0, 2e-5, n)  # the noise of a robot that stands still
-    return pd.DataFrame(
-        {"Timestamp": np.arange(n) / RATE_HZ, "FZ_Base": force[:n], "TCP_Z": height}
-    )
