@@ -134,7 +134,8 @@ class DecisionMaker:
         TraceConflictError
             If the stored decision was made on another trace.
         TraceError
-            If the id has a decision, and `trace` does not fit the `TraceSpec` in force.
+            If the id has a decision, and `trace` does not fit the `TraceSpec` in force or holds
+            values that are no real numbers.
         """
         try:
             earlier = self._outbox.find_earlier(decision_id)
@@ -250,6 +251,11 @@ class DecisionMaker:
         `Reason.NO_MODEL`. If the model raises, or returns bounds that are not 0 <= lower <= upper
         <= 1, that is logged, and the decision is VERIFY, `Reason.MODEL_ERROR`. Without a
         `decision_id` it gets a new id.
+
+        The decision is marked as an audit if the model was certain and the part is verified all the
+        same. Its version is the one in force, also if no model was asked. The record has a copy of
+        the trace, the time by the store's clock, and the hash of the part's number; for an unknown
+        part that is the content hash of the trace.
         """
         part_hash_ = 0 if part is None else part_hash(part)
         # Without a TraceSpec the trace has a fault, and is decided all the same.
@@ -350,13 +356,13 @@ def verify_decision(decision_id: str, part: str | None, version: int, reason: Re
 
 
 def as_part(part: Any) -> str | None:
-    """Convert a part's number to text; None stays None.
+    """Convert a part's number to text, so that 7 and "7" are one part; None stays None.
 
     Raises
     ------
     TraceError
-        For anything but a whole number of at most LONGEST digits (200), or a text of 1 to LONGEST
-        printable characters.
+        For anything but None, a whole number of at most LONGEST digits (200), or a text of 1 to
+        LONGEST printable characters. True and False are no numbers.
     """
     if part is None:
         return None

@@ -67,7 +67,7 @@ class Model(Protocol):
         """Return (lower, upper), each (n,): the bounds of each success probability."""
 
     def decide(self, X: Any) -> Any:
-        """An `Action` for each trace."""
+        """Return an `Action`, or the value of one, for each of the n traces."""
 
 
 class EngineModel(ABC):
@@ -303,7 +303,7 @@ class EngineModel(ABC):
 
     @property
     def safe_mode(self) -> str:
-        """Why the safe mode began; "" outside a safe mode."""
+        """Why the safe mode began; "" outside a safe mode, and by default."""
         return ""
 
     def defect(self) -> str:
@@ -395,7 +395,11 @@ class BaselineAdapter(EngineModel):
         return self
 
     def build_decider(self, conditions: Any) -> Decider:
-        """Build a decider that asks the baseline; SettingError if force limits do not fit."""
+        """Build a decider that asks the baseline; SettingError if force limits do not fit.
+
+        It is not compiled, has no embedding, and asks the very object, so what the baseline learns
+        later counts.
+        """
         return Decider(BaselinePredictor(self.model), conditions)
 
     def add_reference(self, x: Floats, y: int, *_: object, **__: object) -> Floats:
@@ -408,6 +412,7 @@ class BaselineAdapter(EngineModel):
         return x
 
     def successor(self) -> BaselineAdapter:
+        """Return an adapter around a deep copy of the baseline, with what it has learned."""
         return BaselineAdapter(copy.deepcopy(self.model))
 
 
