@@ -33,7 +33,7 @@ def action_of(lower: float, upper: float, accept_threshold: float, reject_thresh
     Returns
     -------
     int
-        The `ActionCode`; VERIFY if neither threshold is reached.
+        The `ActionCode`; VERIFY if neither threshold is reached, ACCEPT if both are.
     """
     if lower >= accept_threshold:
         return ActionCode.ACCEPT.value

@@ -313,7 +313,8 @@ def _verify(x: TraceArray, conditions: DecisionConditions, reason: Reason) -> Ve
 def check_same_trace(stored: StoredDecision, trace: Any, spec: TraceSpec | None) -> Decision:
     """Return the decision of a record, if `trace` is the trace that it was made on.
 
-    The samples must be equal as float32; a NaN equals a NaN.
+    The samples must be equal as float32, after the trace was converted as `spec` demands
+    (`as_trace`); a NaN equals a NaN.
 
     Raises
     ------
@@ -335,8 +336,8 @@ def verify_decision(decision_id: str, part: str | None, version: int, reason: Re
     """Return a VERIFY decision for which neither model nor trace was looked at.
 
     `part` is the part's number, and `version` that of the model. It counts no labels, and has the
-    bounds 0 and 1, no embedding, and 1 as its `propensity`, the probability of a check. Nothing is
-    recorded.
+    bounds 0 and 1, no embedding, and 1 as its `propensity`, the probability of a check. What the
+    model would have done, `predicted`, is VERIFY, too, so it is no audit. Nothing is recorded.
     """
     return Decision(
         id=decision_id,

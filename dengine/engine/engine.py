@@ -868,7 +868,10 @@ class DataEngine(AbstractContextManager["DataEngine"]):
 
     @property
     def model(self) -> Any:
-        """The model in force (of a baseline, the user's object); None before the first retrain."""
+        """The model in force; None before the first retrain.
+
+        Of a baseline it is a trained deep copy of the object that the user handed in.
+        """
         answering = self._live.answering
         return None if answering is None else answering.user_model
 

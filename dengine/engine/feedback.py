@@ -36,7 +36,7 @@ class Remedy(Enum):
 
 
 class Feedback:
-    """Takes in the outcomes of decided parts.
+    """Takes in the outcomes of decided parts, in the thread that uses the engine.
 
     Parameters
     ----------

@@ -41,6 +41,9 @@ PATIENCE = 20  # steps that a candidate leaves to the thread that stores its lab
 class Learner:
     """Takes an engine's model from each outcome to the next version.
 
+    Only the thread that uses the engine calls its methods; other threads may read its properties
+    (`EngineState`).
+
     Parameters
     ----------
     outbox : Outbox

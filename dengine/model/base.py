@@ -58,13 +58,22 @@ class Model(Protocol):
         """Train from scratch on labelled traces. The return value is not read."""
 
     def add(self, x: Any, y: Any) -> Any:
-        """Learn one labelled trace (channels, samples) between two trainings."""
+        """Learn one labelled trace (channels, samples) between two trainings.
+
+        `y` is 1 for success and 0 for failure. The return value is not read.
+        """
 
     def count(self, X: Any) -> tuple[Any, Any]:
-        """Return (n_success, n_failure), each (n,): the labels behind each prediction."""
+        """Return (n_success, n_failure), each (n,): the labels behind each prediction.
+
+        They are whole numbers from 0 to 2**63 - 1; for others the part is verified.
+        """
 
     def predict_interval(self, X: Any) -> tuple[Any, Any]:
-        """Return (lower, upper), each (n,): the bounds of each success probability."""
+        """Return (lower, upper), each (n,): the bounds of each success probability.
+
+        Unless 0 <= lower <= upper <= 1, an engine verifies the part.
+        """
 
     def decide(self, X: Any) -> Any:
         """Return an `Action`, or the value of one, for each of the n traces."""
