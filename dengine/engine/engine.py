@@ -93,7 +93,7 @@ class RunOptions(TypedDict, total=False):
 
 
 def _close_forgotten(outbox: Outbox) -> None:
-    """Close the outbox of an engine that a program did not close; an error is logged.
+    """Close the outbox of an engine that a program did not close; a StoreError is logged.
 
     This writes the records that were left. It is called when the engine is garbage-collected or the
     program ends.
