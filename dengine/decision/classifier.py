@@ -107,7 +107,7 @@ class WilsonRadiusClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[mi
         return n_success, n_failure
 
     def predict_interval(self, Z: ArrayLike) -> tuple[Floats, Floats]:
-        """Bound the success probability of each row of Z (n, d).
+        """Bound the success probability of each row of Z (n, d); NotFittedError before `fit`.
 
         Returns
         -------
@@ -118,7 +118,11 @@ class WilsonRadiusClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[mi
         return lower, upper
 
     def decide(self, Z: ArrayLike) -> NDArray[Any]:
-        """Return an `Action` for each row of Z (n, d), shape (n,); VERIFY without neighbours."""
+        """Return an `Action` for each row of Z (n, d), shape (n,); VERIFY without neighbours.
+
+        It is ACCEPT if lower >= `lower_bound`, otherwise REJECT if upper <= 1 - `lower_bound`.
+        Raises NotFittedError before `fit`.
+        """
         positions = self._decisions(Z)[:, 0]
         return np.array([ACTIONS[int(position)] for position in positions], dtype=object)
 
@@ -146,13 +150,18 @@ class WilsonRadiusClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[mi
     def predict(self, Z: ArrayLike) -> NDArray[Any]:
         """Return the more frequent class within the radius for each row of Z (n, d), shape (n,).
 
-        On a tie, and without neighbours, it is the first of two classes, the failure.
+        On a tie, and without neighbours, it is the first of two classes, the failure. If `fit` got
+        a single class, it is always this class. Raises NotFittedError before `fit`.
         """
         rates = self.predict_proba(Z)
         return np.asarray(self.classes_[rates.argmax(axis=1)])
 
     def policy(self) -> Policy:
-        """Return the policy of these settings; SettingError if one of them is out of range."""
+        """Return the policy of these settings; SettingError if one of them is out of range.
+
+        It has alpha, lower bound and interval, and else the defaults, so the guarantee "local".
+        The radius, which is no part of it, is checked as well.
+        """
         check_radius(self.radius)
         return Policy(self.alpha, self.lower_bound, self.interval)
 
@@ -202,7 +211,7 @@ class WilsonRadiusClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[mi
 
 
 def classes_of(y: ArrayLike) -> NDArray[Any]:
-    """Return the sorted distinct labels in `y`, two at most.
+    """Return the sorted distinct labels in `y`, two at most, as an array.
 
     Raises
     ------

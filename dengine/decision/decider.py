@@ -122,7 +122,8 @@ class Decider(nn.Module):
             do. They differ in an audit, and if a force limit rejects. `predicted` is VERIFY if the
             model did not predict.
         reason : int
-            Position in `Reason`; for a faulty trace it is the fault.
+            Position in `Reason`: the fault of a faulty trace, OUTSIDE if a force limit decides,
+            AUDIT if the part is audited, and otherwise the model's reason.
         lower, upper : float
             Bound on the success probability; (0, 1) without a prediction.
         n_success, n_failure : int
@@ -169,7 +170,8 @@ class Decider(nn.Module):
     def is_audited(self, content: int, rate: float) -> bool:
         """Return whether a trace with this content hash is audited: verified although certain.
 
-        That is a fixed function of hash and seed, true for a share `rate` of all hashes.
+        That is a fixed function of hash and seed, true for a share `rate` of all hashes: for none
+        at 0, for all at 1. A hash that is audited at a rate is audited at each higher rate, too.
         """
         return self.toss(content ^ int(self.audit_salt.item())) < int(rate * self.coin_range)
 
@@ -200,7 +202,10 @@ class VerifyAll(nn.Module):
         self.reason = REASONS.index(reason)
 
     def forward(self, x: Tensor, part: int = 0) -> Predicted:
-        """Return VERIFY with the bound (0, 1), no labels and an empty embedding."""
+        """Return VERIFY with the reason, the bound (0, 1), no labels and an empty embedding.
+
+        Trace and part have no effect.
+        """
         return 0, self.reason, 0.0, 1.0, 0, 0, self.embed(x)
 
     def embed(self, x: Tensor) -> Tensor:
@@ -212,7 +217,8 @@ class VerifyAll(nn.Module):
 def decider_without_model(conditions: DecisionConditions, reason: Reason) -> Decider:
     """Return a decider that verifies every part for `reason`; a force limit may still reject.
 
-    Deciders are cached, so the same arguments give the same object.
+    A fault of the trace, or leaving a force limit, is the reason instead. The 16 deciders that were
+    used last are cached, so the same arguments give the same object.
     """
     return Decider(VerifyAll(reason), conditions)
 
@@ -221,6 +227,6 @@ def decider_without_model(conditions: DecisionConditions, reason: Reason) -> Dec
 def trace_gate(channels: int, samples: int) -> TraceGate:
     """Return the module that checks traces (C, T) of this shape for faults and hashes them.
 
-    It is cached: it has no state, so all deciders share it.
+    It is cached (the 16 shapes that were used last): it has no state, so all deciders share it.
     """
     return TraceGate(channels * samples)

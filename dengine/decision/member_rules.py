@@ -30,7 +30,11 @@ class MemberRule(DecisionRule):
         self.evidence = evidence
 
     def action(self, lower: float, upper: float) -> int:
-        """Return what a bound allows at present, as its `ActionCode`."""
+        """Return what a bound allows at present, as its `ActionCode`.
+
+        The part is accepted if `lower` reaches the accept threshold of the evidence, and rejected
+        if 1 - `upper` reaches its reject threshold. It is verified if both hold, or neither.
+        """
         return self.evidence.action(lower, upper)
 
     @torch.jit.export
@@ -44,13 +48,16 @@ class MemberRule(DecisionRule):
     ) -> None:
         """Count the outcome of a part, which may move the thresholds, and begin or end a safe mode.
 
-        Parameters as of `DecisionRule.update`.
+        The parameters are those of `DecisionRule.update`; see `MemberEvidence.update`.
         """
         self.evidence.update(lower, upper, success, predicted, inclusion_probability)
 
     @torch.jit.export
     def observe(self, n_unreported: int, novel: bool) -> None:
-        """Update the drift detectors, which may start the safe mode; as `DecisionRule.observe`."""
+        """Update the drift detectors, which may start the safe mode.
+
+        The parameters are those of `DecisionRule.observe`; see `MemberEvidence.observe`.
+        """
         self.evidence.observe(n_unreported, novel)
 
     @torch.jit.export
@@ -69,7 +76,12 @@ class MemberRule(DecisionRule):
 
 
 class WatchedRule(MemberRule):
-    """The paper's rule with a safe mode, for cells where silence after an accept means success."""
+    """The paper's rule with a safe mode, for cells where silence after an accept means success.
+
+    A part is accepted if lower >= LB and rejected if upper <= 1 - LB. After an alarm of a drift
+    detector it does neither, until the outcomes since then show recovery (`MemberEvidence`). The
+    tolerance of both sides is 1 - LB.
+    """
 
     def __init__(self, alpha: float, lower_bound: float, interval: str = "wilson") -> None:
         tolerance = 1.0 - float(lower_bound)
@@ -80,6 +92,10 @@ class WatchedRule(MemberRule):
 
 class PooledRule(MemberRule):
     """Accept what reaches the target level while the members show that it may be; reject likewise.
+
+    The levels of the score are the same for accepting and rejecting. They go down from LB in steps
+    of half the tolerance 1 - LB, and end at 0.3 or above it. Before there is enough evidence every
+    part is verified.
 
     Parameters
     ----------
@@ -111,6 +127,8 @@ class PooledRule(MemberRule):
 
 class PricedRule(MemberRule):
     """Accept what should cost less than its check while the account allows; reject likewise.
+
+    Each side has two levels of the score: 1 minus half of its tolerance, and 1 minus its tolerance.
 
     Parameters
     ----------

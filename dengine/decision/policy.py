@@ -187,7 +187,11 @@ class Policy:
         return check, escape, false_reject
 
     def to_values(self) -> dict[str, Any]:
-        """Return every setting by its name; the force limits are one text, "none" without any."""
+        """Return every setting by its name; the force limits are one text, "none" without any.
+
+        In this text a space separates two limits. All other values stay as they are, so `prices` is
+        a tuple.
+        """
         limits = " ".join(map(str, self.force_limits)) or NO_LIMITS
         return asdict(self) | {"force_limits": limits}
 
@@ -244,7 +248,7 @@ class Policy:
 
     @property
     def limits(self) -> tuple[ForceLimits, ...]:
-        """The force limits as they act: in shadow mode none rejects."""
+        """The force limits as they act: in shadow mode none rejects, but the part is verified."""
         return tuple(
             replace(item, reject=item.reject and not self.shadow) for item in self.force_limits
         )

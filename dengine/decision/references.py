@@ -309,7 +309,7 @@ class RadiusIndex(nn.Module):
     def add_one(
         self, point: Tensor, label: float, space: int, part: int = 0, number: int = 0
     ) -> None:
-        """Add one point, as `put`, with the sequence number of its label."""
+        """Add one point, like `put`, and set the sequence number of its label in `numbers`."""
         self.numbers[int(self.total) % self.capacity] = number
         self.put(point, label, space, part)
 

@@ -33,7 +33,7 @@ def action_of(lower: float, upper: float, accept_threshold: float, reject_thresh
     Returns
     -------
     int
-        The `ActionCode`; VERIFY if neither threshold is reached.
+        The `ActionCode`; VERIFY if neither threshold is reached, ACCEPT if both are.
     """
     if lower >= accept_threshold:
         return ActionCode.ACCEPT.value
@@ -97,12 +97,20 @@ class DecisionRule(nn.Module):
         self.extra_arguments: tuple[Any, ...] = ()
 
     def forward(self, n_success: int, n_failure: int) -> tuple[int, float, float]:
-        """Return (`ActionCode`, lower, upper) for label counts."""
+        """Return (`ActionCode`, lower, upper) for label counts, 0 or more.
+
+        The two ends bound the success probability by the rule's interval; `action` chooses the
+        action. Nothing is learned.
+        """
         lower, upper = self.bound(n_success, n_failure, self.z)
         return self.action(lower, upper), lower, upper
 
     def action(self, lower: float, upper: float) -> int:
-        """Return what a bound allows at present, as its `ActionCode`."""
+        """Return what a bound allows at present, as its `ActionCode`.
+
+        The paper's rule accepts if `lower` is at least the accept threshold, otherwise rejects if
+        `upper` is at most the reject threshold, and otherwise verifies.
+        """
         return action_of(lower, upper, self.accept_threshold, self.reject_threshold)
 
     @torch.jit.export
@@ -133,6 +141,8 @@ class DecisionRule(nn.Module):
     def observe(self, n_unreported: int, novel: bool) -> None:
         """Take note of what is known without a label; called before each `update`.
 
+        The paper's rule does nothing.
+
         Parameters
         ----------
         n_unreported : int
@@ -143,14 +153,17 @@ class DecisionRule(nn.Module):
 
     @torch.jit.export
     def safe_mode(self) -> int:
-        """Return why the safe mode began: a position in `SAFE_MODES`, 0 outside of one."""
+        """Return why the safe mode began: a position in `SAFE_MODES`, 0 outside of one.
+
+        The paper's rule has no safe mode: it always returns 0.
+        """
         return 0
 
     @torch.jit.unused
     def start_in_safe_mode(self, safe_mode: int) -> None:
-        """Start in a safe mode, like after an alarm; rules without a safe mode ignore it.
+        """Start in a safe mode, like after an alarm; here it does nothing.
 
-        `safe_mode` is a `SafeMode`; NONE changes nothing.
+        `safe_mode` is a `SafeMode`. A rule without a safe mode, like the paper's, ignores it.
         """
 
     @torch.jit.unused

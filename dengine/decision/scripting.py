@@ -106,7 +106,10 @@ def module_state(module: nn.Module, prefix: str) -> State:
 
 
 def arrays_with_prefix(state: Arrays, prefix: str) -> State:
-    """Return the arrays of a state whose names begin with `prefix`, by the rest of their names."""
+    """Return the arrays of a state whose names begin with `prefix`, by the rest of their names.
+
+    The arrays are not copied. Without such a name the result is empty.
+    """
     return {
         name.removeprefix(prefix): array for name, array in state.items() if name.startswith(prefix)
     }

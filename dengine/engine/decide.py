@@ -134,7 +134,8 @@ class DecisionMaker:
         TraceConflictError
             If the stored decision was made on another trace.
         TraceError
-            If the id has a decision, and `trace` does not fit the `TraceSpec` in force.
+            If the id has a decision, and `trace` does not fit the `TraceSpec` in force or holds
+            values that are no real numbers.
         """
         try:
             earlier = self._outbox.find_earlier(decision_id)
@@ -250,6 +251,11 @@ class DecisionMaker:
         `Reason.NO_MODEL`. If the model raises, or returns bounds that are not 0 <= lower <= upper
         <= 1, that is logged, and the decision is VERIFY, `Reason.MODEL_ERROR`. Without a
         `decision_id` it gets a new id.
+
+        The decision is marked as an audit if the model was certain and the part is verified all the
+        same. Its version is the one in force, also if no model was asked. The record has a copy of
+        the trace, the time by the store's clock, and the hash of the part's number; for an unknown
+        part that is the content hash of the trace.
         """
         part_hash_ = 0 if part is None else part_hash(part)
         # Without a TraceSpec the trace has a fault, and is decided all the same.
@@ -307,7 +313,8 @@ def _verify(x: TraceArray, conditions: DecisionConditions, reason: Reason) -> Ve
 def check_same_trace(stored: StoredDecision, trace: Any, spec: TraceSpec | None) -> Decision:
     """Return the decision of a record, if `trace` is the trace that it was made on.
 
-    The samples must be equal as float32; a NaN equals a NaN.
+    The samples must be equal as float32, after the trace was converted as `spec` demands
+    (`as_trace`); a NaN equals a NaN.
 
     Raises
     ------
@@ -329,8 +336,8 @@ def verify_decision(decision_id: str, part: str | None, version: int, reason: Re
     """Return a VERIFY decision for which neither model nor trace was looked at.
 
     `part` is the part's number, and `version` that of the model. It counts no labels, and has the
-    bounds 0 and 1, no embedding, and 1 as its `propensity`, the probability of a check. Nothing is
-    recorded.
+    bounds 0 and 1, no embedding, and 1 as its `propensity`, the probability of a check. What the
+    model would have done, `predicted`, is VERIFY, too, so it is no audit. Nothing is recorded.
     """
     return Decision(
         id=decision_id,
@@ -350,13 +357,13 @@ def verify_decision(decision_id: str, part: str | None, version: int, reason: Re
 
 
 def as_part(part: Any) -> str | None:
-    """Convert a part's number to text; None stays None.
+    """Convert a part's number to text, so that 7 and "7" are one part; None stays None.
 
     Raises
     ------
     TraceError
-        For anything but a whole number of at most LONGEST digits (200), or a text of 1 to LONGEST
-        printable characters.
+        For anything but None, a whole number of at most LONGEST digits (200), or a text of 1 to
+        LONGEST printable characters. True and False are no numbers.
     """
     if part is None:
         return None

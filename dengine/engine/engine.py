@@ -93,7 +93,7 @@ class RunOptions(TypedDict, total=False):
 
 
 def _close_forgotten(outbox: Outbox) -> None:
-    """Close the outbox of an engine that a program did not close; an error is logged.
+    """Close the outbox of an engine that a program did not close; a StoreError is logged.
 
     This writes the records that were left. It is called when the engine is garbage-collected or the
     program ends.
@@ -834,7 +834,10 @@ class DataEngine(AbstractContextManager["DataEngine"]):
             return self._corrections.set_policy(policy, author)
 
     def set_shadow(self, on: bool, author: str = "") -> Changed:
-        """Begin or end the shadow mode, in which every part is verified; see `set_policy`."""
+        """Begin or end the shadow mode, in which every part is verified; see `set_policy`.
+
+        If the shadow mode is in this state already, nothing changes.
+        """
         return self.set_policy(replace(self.policy, shadow=on), author)
 
     def certificate(self) -> Certificate:
@@ -865,7 +868,10 @@ class DataEngine(AbstractContextManager["DataEngine"]):
 
     @property
     def model(self) -> Any:
-        """The model in force (of a baseline, the user's object); None before the first retrain."""
+        """The model in force; None before the first retrain.
+
+        Of a baseline it is a trained deep copy of the object that the user handed in.
+        """
         answering = self._live.answering
         return None if answering is None else answering.user_model
 
@@ -876,7 +882,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
 
     @property
     def safe_mode(self) -> str:
-        """Why the engine is in safe mode; "" if it is not.
+        """Why the engine is in safe mode; "" if it is not, and always for a rule without one.
 
         In safe mode it verifies parts until new outcomes allow accepting, or rejecting, again.
         """
@@ -886,7 +892,9 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         """Return a decision with its trace, and with its label if it has one; None for an
         unknown id.
 
-        Raises StoreError if the id cannot be looked up, and ReportError for an invalid id.
+        A decision is found as soon as it was made; a label is returned once it is on disk. Raises
+        StoreError if the id cannot be looked up within the store's time limit or the stored trace
+        is damaged, and ReportError for an invalid id.
         """
         return self._outbox.find_decision(as_id(decision_id))
 
@@ -894,27 +902,38 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         """Return how the engine is doing, once everything is written (`flush`); arguments and
         errors are those of `history.status.status`.
 
-        If the disk does not take everything, `store_fault` says why, and the counts lack the rest.
+        If the disk or the store does not take everything in time, `store_fault` says why, and the
+        counts lack the rest.
         """
         with suppress(NotTakenError):
             self.flush()
         return self.state.complete(status(self.store, last, watching))
 
     def history(self, last: int | None = None, **where: Any) -> Iterator[StoredDecision]:
-        """Yield the decisions so far, newest last.
+        """Return an iterator over the decisions in the store, newest last, without their traces.
 
-        Arguments and errors are those of `history.status.history`.
+        Nothing is waited for: call `flush` before, or the newest decisions and labels may be
+        missing. `last` is the number of newest decisions, and None all; `where` selects by action,
+        reason, label, since, until, predicted or part. Raises SettingError for a value that these
+        cannot have, TypeError for another name, and StoreError if the store cannot be read; see
+        `history.status.history`.
         """
         return history(self.store, last, **where)
 
     def history_frame(self, last: int | None = None, **where: Any) -> pd.DataFrame:
-        """Return `history` as a DataFrame with a row for each decision, indexed by its id."""
+        """Return `history` as a DataFrame with a row for each decision, indexed by its id.
+
+        Arguments and errors are those of `history`.
+        """
         return as_frame(self.history(last, **where))
 
     def explain(self, decision_id: str, neighbours: int = 10) -> Explanation:
         """Explain a decision by its nearest references, at most `neighbours` of them.
 
-        Raises the errors of `history.explain.explain`, for example ReportError for an unknown id.
+        It is read from the store, and nothing is waited for: a decision that is only in the journal
+        is unknown until `flush`. In place of an id it takes the number of a part, too
+        (`find_decision_id`). Raises the errors of `history.explain.explain`, for example
+        ReportError for an unknown id.
         """
         return explain(self.store, decision_id, neighbours)
 

@@ -13,6 +13,9 @@ class ExclusiveUse:
 
     Entering it while another thread is inside raises StoreError at once. A SIGINT that comes
     meanwhile is handled when the block ends, so that a label is stored and counted, or neither.
+    Several are handled like one, and an exception of the handler is raised from the block. This
+    holds in the main thread, for a handler that is a Python function; in other cases the handling
+    of SIGINT is not changed.
     """
 
     def __init__(self) -> None:

@@ -36,7 +36,7 @@ class Remedy(Enum):
 
 
 class Feedback:
-    """Takes in the outcomes of decided parts.
+    """Takes in the outcomes of decided parts, in the thread that uses the engine.
 
     Parameters
     ----------
@@ -141,9 +141,10 @@ class Feedback:
 
         With `Policy(stops="all")`, under which a bad part would have stopped the line, each part
         counts as good: rule and references learn it now, and its label, CONFIRMED, is recorded
-        without waiting for the disk. An exception of rule or model is logged, not raised, and a
-        part from before the present rule began does not update the rule. With "some" the parts are
-        only counted, and nothing is learned. Either way they wait for an outcome no longer.
+        without waiting for the disk, and counts as new. An exception of rule or model is logged,
+        not raised, and a part from before the present rule began does not update the rule. With
+        "some" the parts are only counted, and nothing is learned. Either way they wait for an
+        outcome no longer.
         """
         while self._unreported:
             _, stored = self._unreported.popitem(last=False)
@@ -162,6 +163,10 @@ class Feedback:
         stop is recorded, and learned later, as a correction. The attribute `remedy` is set if the
         rule must be rebuilt, which is not done here. An exception of rule or model is logged, not
         raised.
+
+        A label that is learned counts as new and enters the training window; in a product it does
+        so later, from the store. The label of a trace with a fault is only recorded. The part waits
+        for an outcome or a check no longer.
         """
         id_ = stored.decision.id
         if self._unsynced.get(id_) is not success:
@@ -274,7 +279,10 @@ class Feedback:
                 self._live.answering.renumber_reference(provisional, number)
 
     def count_new_labels(self, after: int) -> None:
-        """Count the labels of the training window with a number above this one as new."""
+        """Set `new_labels` to the number of labels in the training window that came after this one.
+
+        `after` is the sequence number of a label; labels with a larger number count.
+        """
         self.new_labels = self._window.count_newer(after)
 
     def give_labels_back(self, n_labels: int) -> None:
@@ -306,7 +314,10 @@ class Feedback:
         return remedy
 
     def retry_remedy(self, remedy: Remedy) -> None:
-        """Put a remedy back that failed because the store is unavailable."""
+        """Put a remedy back that failed because the store is unavailable.
+
+        A remedy that is set meanwhile is replaced.
+        """
         self.remedy = remedy
 
     def begin_policy(self) -> None:

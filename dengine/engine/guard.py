@@ -27,7 +27,8 @@ def guarded(
 ) -> T | None:
     """Call a function and return its result; if it raises, log the exception and return None.
 
-    `consequence` is the text of the log: it says what follows from the failure.
+    `consequence` is the text of the log: it says what follows from the failure. KeyboardInterrupt
+    and SystemExit are raised.
     """
     try:
         return call(*arguments, **options)

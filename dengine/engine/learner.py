@@ -41,6 +41,9 @@ PATIENCE = 20  # steps that a candidate leaves to the thread that stores its lab
 class Learner:
     """Takes an engine's model from each outcome to the next version.
 
+    Only the thread that uses the engine calls its methods; other threads may read its properties
+    (`EngineState`).
+
     Parameters
     ----------
     outbox : Outbox
@@ -291,13 +294,17 @@ class Learner:
 
         A version that is trained is put in force or dropped; for that the call waits for the store,
         but it never waits for a training. A training that is not done is discarded, and another
-        begins as soon as it can, after the change.
+        begins as soon as it can, after the change. A version that is stored, but lacks newer labels
+        that the store does not take now, goes on waiting.
         """
         self.advance(to_the_end=True)
         self._discard_training()
 
     def _discard_training(self) -> None:
-        """Discard a training that is under way in the executor, and ask for another one."""
+        """Discard a training that is under way in the executor, and ask for another one.
+
+        This is logged. Nothing happens if none is under way.
+        """
         if self._retrainer.discard():
             log.info("a training was discarded for a change; another one begins")
             self._is_requested = True

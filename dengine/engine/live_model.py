@@ -34,6 +34,8 @@ Point = NDArray[np.float32]
 class LiveModel:
     """The model in force, with its decision rule and its references.
 
+    Only the thread that uses the engine changes it; other threads may read its attributes.
+
     Parameters
     ----------
     template : EngineModel
@@ -352,7 +354,8 @@ class LiveModel:
     def change_evidence(self, template: EngineModel, evidence: EvidenceWindow) -> None:
         """Go on with another template, and other decisions that a rebuilt rule is updated with.
 
-        The template is the untrained model, from which the first version is trained.
+        The template is the untrained model, from which the first version is trained. The rule is
+        not rebuilt here.
         """
         self.template = template
         self.evidence = evidence

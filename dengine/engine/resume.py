@@ -105,7 +105,10 @@ def find_clean_start(
     corrections = {correction.seq: correction for correction in store.corrections.after()}
 
     def is_clean(trained_on: TrainedOn) -> bool:
-        """Whether it has seen no forgotten label; a training after one was forgotten has not."""
+        """Return whether weights that were trained on these labels saw none that is forgotten now.
+
+        A label that was forgotten before the training does not count: the training left it out.
+        """
         return not any(
             correction.success is None
             and correction.number > trained_on.corrected_to

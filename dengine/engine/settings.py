@@ -446,9 +446,11 @@ def refuse_idle(idle: Collection[str]) -> None:
 
 
 def flat_settings(recipe: Recipe) -> dict[str, Any]:
-    """Return every setting of a recipe by its name, those of its policy among them.
+    """Return every setting of a recipe by its name, those of its policy in place of `policy`.
 
-    The reducer's class is imported if the recipe leaves `radius` or `retrain_every` to it.
+    The policy's are as of `Policy.to_values`, so the force limits are one text. The reducer's class
+    is imported if the recipe leaves `radius` or `retrain_every` to it; SettingError if it cannot
+    be.
     """
     settings = {field.name: getattr(recipe, field.name) for field in fields(recipe)}
     del settings["policy"]

@@ -25,12 +25,15 @@ class EngineState:
 
     @property
     def new_labels(self) -> int:
-        """Labels since the last retrain began."""
+        """Labels since the last retrain began, as `Feedback.new_labels` counts them."""
         return self._learner.feedback.new_labels
 
     @property
     def is_retraining(self) -> bool:
-        """Whether a retrain is under way in the executor, or its version is not in force yet."""
+        """Whether a retrain is under way in the executor, or its version is not in force yet.
+
+        It is also True while a retrain that was requested waits until it can begin.
+        """
         return self._learner.is_busy
 
     @property
@@ -40,7 +43,7 @@ class EngineState:
 
     @property
     def retrain_fault(self) -> str:
-        """What is wrong if retrains are dropped again and again; "" if they are not."""
+        """What is wrong if the last three or more retrains were dropped; "" if they were not."""
         return retrain_fault(self._learner.dropped, self._live.version)
 
     @property
@@ -50,7 +53,10 @@ class EngineState:
 
     @property
     def store_fault(self) -> str:
-        """Why the store, or its journal, cannot be written at present; "" if both can be."""
+        """What is wrong with the store or its journal at present; "" if nothing is.
+
+        That is the `integrity_error` if there is one, else why they cannot be written.
+        """
         return self._outbox.fault
 
     @property
@@ -62,8 +68,8 @@ class EngineState:
         """Return a copy of a status from the store, completed by what only the engine knows.
 
         That is the version in force, the reason of a safe mode, the number of labels since the
-        newest retrain began, why the store cannot be written, the age of the oldest record that the
-        store lacks, and whether a retrain is under way.
+        newest retrain began, what is wrong with the store (`store_fault`), the age of the oldest
+        record that the store lacks, and whether a retrain is under way (`is_retraining`).
         """
         return replace(
             status,

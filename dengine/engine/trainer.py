@@ -65,7 +65,7 @@ class TrainingWindow:
 
     @property
     def newest_seq(self) -> int:
-        """Sequence number of the newest label; 0 before the first."""
+        """Sequence number of the newest label; 0 if the window is empty."""
         return int(self._block[0][self._end - 1]) if self._end else 0
 
     def add(self, trace: TraceArray, label: int, hash_: int, seq: int) -> None:
@@ -123,7 +123,8 @@ class TrainingWindow:
     def row_after(self, seq: int) -> tuple[int, TraceArray, int, int] | None:
         """Return the first label of the window with a number above this one; None without any.
 
-        It is the label's number, its trace (channels, samples), the label and its hash.
+        It is the label's number, its trace (channels, samples), the label (1 good, 0 bad) and its
+        hash. The trace is a view, not to be written to.
         """
         i = self._end - self.count_newer(seq)
         if i == self._end:
@@ -163,6 +164,7 @@ class TrainedOn:
         """Return whether the weights may have learned from the label of this number.
 
         They have if it is among these labels, or older than all of them: an earlier version had it.
+        Without any labels it is False.
         """
         return bool(len(self.seq)) and (seq < self.seq[0] or seq in self.seq)
 
@@ -182,7 +184,10 @@ class TrainedOn:
 
     @classmethod
     def from_state(cls, state: Mapping[str, NDArray[Any]]) -> Self:
-        """Return the record that `to_state` turned into arrays."""
+        """Return the record that `to_state` turned into arrays; without "pinned" it is not pinned.
+
+        Arrays of other names are ignored. Raises KeyError if another of the four is missing.
+        """
         pinned = int(state.get("pinned", 0))
         return cls(state["trained_on"], int(state["trained_as"]), int(state["counts_from"]), pinned)
 

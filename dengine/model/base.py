@@ -58,16 +58,25 @@ class Model(Protocol):
         """Train from scratch on labelled traces. The return value is not read."""
 
     def add(self, x: Any, y: Any) -> Any:
-        """Learn one labelled trace (channels, samples) between two trainings."""
+        """Learn one labelled trace (channels, samples) between two trainings.
+
+        `y` is 1 for success and 0 for failure. The return value is not read.
+        """
 
     def count(self, X: Any) -> tuple[Any, Any]:
-        """Return (n_success, n_failure), each (n,): the labels behind each prediction."""
+        """Return (n_success, n_failure), each (n,): the labels behind each prediction.
+
+        They are whole numbers from 0 to 2**63 - 1; for others the part is verified.
+        """
 
     def predict_interval(self, X: Any) -> tuple[Any, Any]:
-        """Return (lower, upper), each (n,): the bounds of each success probability."""
+        """Return (lower, upper), each (n,): the bounds of each success probability.
+
+        Unless 0 <= lower <= upper <= 1, an engine verifies the part.
+        """
 
     def decide(self, X: Any) -> Any:
-        """An `Action` for each trace."""
+        """Return an `Action`, or the value of one, for each of the n traces."""
 
 
 class EngineModel(ABC):
@@ -303,7 +312,7 @@ class EngineModel(ABC):
 
     @property
     def safe_mode(self) -> str:
-        """Why the safe mode began; "" outside a safe mode."""
+        """Why the safe mode began; "" outside a safe mode, and by default."""
         return ""
 
     def defect(self) -> str:
@@ -395,7 +404,11 @@ class BaselineAdapter(EngineModel):
         return self
 
     def build_decider(self, conditions: Any) -> Decider:
-        """Build a decider that asks the baseline; SettingError if force limits do not fit."""
+        """Build a decider that asks the baseline; SettingError if force limits do not fit.
+
+        It is not compiled, has no embedding, and asks the very object, so what the baseline learns
+        later counts.
+        """
         return Decider(BaselinePredictor(self.model), conditions)
 
     def add_reference(self, x: Floats, y: int, *_: object, **__: object) -> Floats:
@@ -408,6 +421,7 @@ class BaselineAdapter(EngineModel):
         return x
 
     def successor(self) -> BaselineAdapter:
+        """Return an adapter around a deep copy of the baseline, with what it has learned."""
         return BaselineAdapter(copy.deepcopy(self.model))
 
 

@@ -122,7 +122,7 @@ class Predictor(nn.Module):
 
     @torch.jit.export
     def embed(self, x: Tensor) -> Tensor:
-        """Return the scaled embedding (K, d) of one trace (C, T)."""
+        """Return the embedding (K, d) of one trace (C, T), each space divided by its scale."""
         z: Tensor = self.encoder(x.unsqueeze(0))[0]
         return z / self.scale if self.scaled else z
 
@@ -266,7 +266,8 @@ def compare_points(decider: Decider, X: Floats, points: Floats) -> str:
 def is_close(points: Floats, expected: Floats, tolerance: float = SAME_POINTS) -> bool:
     """Return whether points are not NaN and equal the expected ones within a tolerance.
 
-    A coordinate may differ by `tolerance` times (1 + the absolute value of the expected one).
+    A coordinate may differ by `tolerance` times (1 + the absolute value of the expected one). Equal
+    infinities are close. For empty arrays it is True.
     """
     return bool(np.allclose(points, expected, rtol=tolerance, atol=tolerance))
 
@@ -360,10 +361,15 @@ class ModelPrediction(EngineModel):
 
     @property
     def min_traces(self) -> int:  # type: ignore[override]  # it depends on the reducer
+        """Number of labelled traces that the first training waits for, as the reducer says."""
         return self.spaces.min_traces
 
     @property
     def report(self) -> FitReport:
+        """The report of the reducer's last training; its note also names repeats (`repeats_note`).
+
+        Without a training it is an empty report.
+        """
         report = self.spaces.report
         return replace(report, note="; ".join(filter(None, (report.note, self._note))))
 
@@ -609,6 +615,11 @@ class ModelPrediction(EngineModel):
         self.index.renumber(old, new)
 
     def change_reference(self, number: int, hash_: int, y: int | None) -> bool:
+        """Relabel the reference with this label number, or remove it if `y` is None.
+
+        Returns False, with nothing changed, if it is of another part than `hash_`. Returns True
+        otherwise, also if the reference has left the index (`RadiusIndex.relabel`).
+        """
         return self.index.relabel(number, hash_, y)
 
     def update_rule(
@@ -674,6 +685,7 @@ class ModelPrediction(EngineModel):
 
     @property
     def safe_mode(self) -> str:
+        """Why the rule's safe mode began, a text of `SAFE_MODES`; "" outside a safe mode."""
         return SAFE_MODES[self.rule.safe_mode()]
 
     def predict_one(self, x: Floats, hash_: int = 0) -> Prediction:
@@ -861,7 +873,10 @@ class ModelPrediction(EngineModel):
         return self
 
     def needs_refit(self, state: Arrays) -> bool:
-        """Return whether a state does not hold the reducer, which must then be trained again."""
+        """Return whether a state does not hold the reducer, which must then be trained again.
+
+        The state holds it if the name of an array begins with "reducer.".
+        """
         return not arrays_with_prefix(state, "reducer.")
 
     def __getstate__(self) -> dict[str, Any]:
