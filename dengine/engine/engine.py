@@ -790,8 +790,10 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         Raises
         ------
         StoreError
-            While another thread uses the engine.
+            While another thread uses the engine, and if it is closed, was opened for reading or
+            before a fork.
         """
+        self._outbox.check_usable()
         with self._exclusive:
             self._learner.advance(to_the_end=not brief)
             self._learner.retrain_if_due(self.recipe.retrain_every, once=True)

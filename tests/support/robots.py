@@ -182,7 +182,7 @@ class FakeController(AbstractContextManager):
         self._troubles = {(trouble.part, trouble.sample): trouble for trouble in troubles}
         self._until = Counter[str]()  # by kind of trouble: the cycle at which it ends
         self._clients, self._delayed = [], b""
-        self._cycle, self._begin = 0, 0  # the latter is the one at which the clock began
+        self._cycle, self._begin = 0, -(10**5)  # the latter is the one at which the clock began
         self._period = CYCLE_S / speed
         self._lock = threading.Lock()
         self._server = socket.create_server((self.host, 0))

@@ -5,6 +5,7 @@ import sys
 from collections import Counter
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
 from threading import Event
 from time import sleep
 from unittest.mock import Mock
@@ -67,6 +68,17 @@ def test_a_cell_without_one_of_its_four_methods_is_refused_before_the_first_part
     message = f"Expected a cell with the methods .*got Half without {' and '.join(lacks.split())};"
     with pytest.raises(SettingError, match=message):
         make().run(half, 1)
+
+
+def test_an_engine_that_was_opened_for_reading_neither_decides_nor_learns(data, tmp_path):
+    with make(store=tmp_path / "e.db") as engine:
+        id_ = play(engine, data, 0, 10)[-1].decision.id
+    with DataEngine.open(tmp_path / "e.db", reading=True) as reader:
+        for call in (reader.poll, reader.retrain, partial(reader.decide, data.X[11])):
+            with pytest.raises(StoreError, match="opened for reading"):
+                call()
+        with pytest.raises(StoreError, match="opened for reading"):
+            reader.report(id_, success=True)
 
 
 def test_a_trace_that_comes_again_has_no_vote_on_itself(trained, data):

@@ -135,11 +135,10 @@ class UrCell(AbstractContextManager["UrCell"]):
         self.last: InsertionRecord | None = None
         self.incomplete = 0
         try:
-            self._newest = self._wait_until_ready()  # package of the controller
+            self._number = self._wait_until_ready()  # of the last order
         except BaseException:
             self.close()
             raise
-        self._number = int(self._newest.values[ORDER]) // 10  # of the last order
 
     def close(self) -> None:
         """Close the connection and end its thread; the robot's program goes on."""
@@ -196,7 +195,7 @@ class UrCell(AbstractContextManager["UrCell"]):
         complete by then. Raise CellError if the robot does not answer in time, fails, or its
         program stops.
         """
-        self.recorder.arm()  # discards what was received between orders
+        newest = self.recorder.arm()  # discards what was received between orders
         self._number = self._number % MAX_NUMBER + 1
         is_insertion = verb is Verb.INSERT
         if is_insertion:
@@ -206,11 +205,12 @@ class UrCell(AbstractContextManager["UrCell"]):
         repeat_until = time.monotonic() + REPEAT_S
         result: ResultCode | None = None
         for row in self.recorder.stream.rows(self.order_timeout):
-            if row.timestamp < self._newest.timestamp:  # restarted: the order was meant for before
+            newest = newest or row
+            if row.timestamp < newest.timestamp:  # restarted: the order was meant for before
                 repeat_until = 0.0
-            elif row.session > self._newest.session and time.monotonic() < repeat_until:
+            elif row.session > newest.session and time.monotonic() < repeat_until:
                 self.recorder.stream.write(order)
-            self._newest = row
+            newest = row
             if is_insertion and self.last is None:
                 self.last = self.recorder.feed(row)
             result = result or self._find_result(row, verb)
@@ -253,9 +253,9 @@ class UrCell(AbstractContextManager["UrCell"]):
         order = f"order {self._number} ({verb.name.lower()})"
         raise CellError(f"Expected the robot to carry out {order}, {failure} begin again.")
 
-    def _wait_until_ready(self) -> Row:
-        """Wait until the robot's program runs and has answered its last order; return the package
-        that shows it.
+    def _wait_until_ready(self) -> int:
+        """Wait until the robot's program runs and has answered its last order; return the number of
+        this order.
 
         Packages that arrive before are discarded. The numbers of the order and of the result in
         the registers must be equal. Raise CellError after `start_timeout` seconds; its message says
@@ -268,7 +268,7 @@ class UrCell(AbstractContextManager["UrCell"]):
             if state != Runtime.PLAYING:
                 problem = "its program does not run"
             elif ordered // 10 == answered // 10:
-                return row
+                return ordered // 10
         if not problem:
             raise self._timeout_error("to send its state")
         raise CellError(

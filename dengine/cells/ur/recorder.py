@@ -126,10 +126,13 @@ class RtdeRecorder(AbstractContextManager["RtdeRecorder"]):
     def __exit__(self, *raised: object) -> None:
         self.close()
 
-    def arm(self) -> None:
-        """Discard what was received so far, begun or not; record what begins from now on."""
+    def arm(self) -> Row | None:
+        """Discard what was received so far, begun or not; record what begins from now on.
+
+        Returns the newest package so far, None before the first.
+        """
         self._reset()
-        self.stream.clear()
+        return self.stream.clear()
 
     def report(self) -> StreamReport:
         """Return the counts of all packages since the connection was opened."""

@@ -295,10 +295,11 @@ class RtdeStream:
                 row = self._rows.popleft()
             yield row
 
-    def clear(self) -> None:
-        """Discard the buffered packages."""
+    def clear(self) -> Row | None:
+        """Discard the buffered packages; return the newest so far, None before the first."""
         with self._news:
             self._rows.clear()
+            return self._newest
 
     def write(self, values: Values) -> None:
         """Write inputs of the controller; without a connection nothing is written or raised.
