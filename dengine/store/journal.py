@@ -73,8 +73,9 @@ def encode_record(record: Record) -> bytes:
     """Return a record (decision, label or event) as bytes.
 
     They are the length of a JSON text, this text with the record's kind and fields, and the float32
-    values of a decision's trace or of a label's `point`, the embedding of the trace. The mark,
-    length, checksum and digest that stand before each record in a journal are not included.
+    values of a decision's trace or of a label's `point`, the embedding of the trace. The number
+    and the label of a decision are left out, and so are the mark, length, checksum and digest that
+    stand before each record in a journal.
     """
     if isinstance(record, StoredDecision):
         row = decision_row(record) | {"shape": record.trace.shape}
@@ -89,7 +90,8 @@ def encode_record(record: Record) -> bytes:
 def decode_record(blob: bytes) -> Record:
     """Return the record that `encode_record` wrote; raise StoreError for bytes that have no record.
 
-    A changed number or sample is not noticed here; the journal checks for that.
+    A decision has number 0 and no label. A changed number or sample is not noticed here; the
+    journal checks for that.
     """
     with instead(
         StoreError,
@@ -110,7 +112,9 @@ def decode_record(blob: bytes) -> Record:
 
 @dataclass
 class Head:
-    """What the small file beside a journal says; by default that of an earlier release.
+    """What the head, the small file beside a journal, says.
+
+    The default values stand for a head that is missing or damaged.
 
     Attributes
     ----------
@@ -539,7 +543,8 @@ def journal_path(url: Any, cell_id: str) -> Path:
     Path
         Beside an SQLite file, links resolved, STORE.CELL.journal. For a server CELL.DIGEST.journal
         in the folder dengine of the user's state folder (`XDG_STATE_HOME`, or ~/.local/state), with
-        the first 60 characters of the cell and a digest of the server, the database and the cell.
+        the first 60 characters of the escaped cell, and 12 hexadecimal digits of a digest of the
+        server with its port, the database and the cell.
     """
     name = urllib.parse.quote(cell_id, safe="")
     if IGNORES_CASE:  # or cell A and cell a would have one journal

@@ -154,8 +154,9 @@ class Outbox(ABC):
         Returns
         -------
         StoredDecision
-            A copy of `item` with its number. If the id already has a decision in memory, that
-            decision is returned, and nothing is recorded.
+            A copy of `item` with its number, the cell's next one. If one of the newest 1,000
+            decisions of a `JournalledStore` has the same id, that decision is returned, and nothing
+            is recorded; a `MemoryStore` does not check this.
         """
 
     def replace_decision(self, item: StoredDecision) -> StoredDecision:
@@ -336,7 +337,10 @@ class Outbox(ABC):
         """
 
     def evict_decision(self, decision_id: str) -> None:  # noqa: B027  # a default
-        """Drop a decision from memory, so that it is read from the database again."""
+        """Drop a decision from memory, so that it is read from the database again.
+
+        What the database lacks is not dropped. For a store in memory this does nothing.
+        """
 
     def call_store(self, call: Callable[[], T]) -> T:
         """Run a call of the store, and return its result within `limit` seconds.
@@ -383,5 +387,5 @@ class Outbox(ABC):
     def close(self) -> None:
         """Write what can be written within seconds, and let another engine own the cell.
 
-        A second call does nothing, nor does one in a forked process.
+        With a journal a second call does nothing, nor does one in a forked process.
         """

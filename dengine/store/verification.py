@@ -161,6 +161,7 @@ def verify_history(
         The cell; None: all cells.
     expect : str or None
         A digest of an earlier check, or its first 8 digits or more, that the history must contain.
+        Capital letters and blanks around it do not matter.
     on_rows : callable, optional
         Called with the number of rows that were just read, for a progress bar: after each 500, and
         at the end of each cell with the rest, which may be 0.
