@@ -65,7 +65,7 @@ def read_key(path: FilePath, error: type[DengineError]) -> bytes:
 def check_size(size: float, source: object) -> None:
     """Raise DataError if arrays would need too much memory.
 
-    The limit is 8 GB, or half of the machine's memory if that is known and less.
+    The limit is 8 GiB, or half of the machine's memory if that is known and less.
 
     Parameters
     ----------

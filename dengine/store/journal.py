@@ -567,7 +567,7 @@ def sqlite_file(url: Any) -> Path:
 
 
 def head_path(journal: Path) -> Path:
-    """Return the path of the head, the small file beside a journal."""
+    """Return the path of the head, the small file beside a journal: its name with ".head" added."""
     return journal.with_name(f"{journal.name}.head")
 
 

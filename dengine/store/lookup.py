@@ -43,7 +43,8 @@ class DecisionIndex:
         """Add a record that was just recorded; an event, which has no id, changes nothing.
 
         `entry` holds the record. It replaces an earlier decision of that id, or an earlier label of
-        that decision. The oldest of more than N_RECENT decisions (1,000) leaves `recent`.
+        that decision. The oldest of more than N_RECENT decisions (1,000) leaves `recent`; one that
+        is replaced counts as old as it was.
         """
         record = entry.record
         if isinstance(record, StoredDecision):

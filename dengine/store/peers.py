@@ -120,7 +120,7 @@ def list_cells(url: str) -> list[CellSummary]:
     It has the cell's product, its numbers of decisions and labels, the newest version that was put
     in force in the cell or its product, and the time of the newest decision or label. Forgotten
     labels and those of quarantined traces count; records that are only in a journal do not. Raise
-    StoreError if the database is not there or is no store. Nothing is written.
+    StoreError if the database is not there or is no store. No row is written (see `reading`).
     """
     with reading(url) as connection:
         settings = connection.execute(sa.select(SETTING)).all()

@@ -254,7 +254,10 @@ def _selected_cells(connection: sa.Connection, cell_id: str | None) -> list[str]
 
 
 class CellCheck:
-    """The check of one cell's history.
+    """The check of one cell's history; `run` makes it, once.
+
+    To make a `CellCheck` reads the ledger's key from the file that DENGINE_LEDGER_KEY names, and
+    raises StoreError if that cannot be read.
 
     Parameters
     ----------
