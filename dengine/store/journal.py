@@ -574,10 +574,11 @@ def head_path(journal: Path) -> Path:
 def read_undrained(path: Path) -> tuple[list[Record], Journal]:
     """Return the records of a journal that its store has not taken, and the journal, closed.
 
-    The records are those of `Journal.decode_undrained`. Nothing is locked or changed, so an engine
-    may be using the journal. Raise StoreError if the file cannot be opened or is no journal, and
-    for an intact record that cannot be decoded, like that of another release of dengine. If the
-    disk fails later, while the records are read, OSError is raised.
+    The records are those of `Journal.decode_undrained`; the journal's attribute `loss` says which
+    are missing or damaged. Nothing is locked or changed, so an engine may be using the journal.
+    Raise StoreError if the file cannot be opened or is no journal, and for an intact record that
+    cannot be decoded, like that of another release of dengine. If the disk fails later, while the
+    records are read, OSError is raised.
     """
     journal = Journal(path, owning=False)
     try:
@@ -597,7 +598,10 @@ def read_head(journal: Path) -> Head:
 
 
 def _parse_header(header: bytes) -> dict[str, Any]:
-    """Return the fields of a header by name; raise one of the types in DAMAGES if it is damaged."""
+    """Return the fields of a header by name; raise one of the types in DAMAGES if it is damaged.
+
+    A header without `n_drained`, of an earlier release, gets 0.
+    """
     return {"n_drained": 0} | _unpack_fields(header[len(MAGIC) :])
 
 

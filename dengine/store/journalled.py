@@ -253,7 +253,9 @@ class JournalledStore(Outbox):
     def pop_label_numbers(self) -> LabelNumbers:
         """Return (decision id, label number) of each label that was drained since the last call.
 
-        They are in the order in which they were drained. Without a product the list is empty.
+        They are in the order in which they were drained. A report that repeats a stored label has
+        the number of that label, and a label that became a dead letter has no pair. Without a
+        product the list is empty.
         """
         return self._drainer.pop_label_numbers()
 

@@ -121,7 +121,7 @@ class Outbox(ABC):
     def verify_all_reason(self) -> str:
         """Why every part must be verified: an integrity error, or a journal that cannot be written.
 
-        "" if neither. Without a journal, as here, it is the `integrity_error`.
+        "" if neither. This default, for an outbox without a journal, is the `integrity_error`.
         """
         return self.integrity_error
 
@@ -129,7 +129,7 @@ class Outbox(ABC):
     def fault(self) -> str:
         """What is wrong with the store or the journal at present; "" if nothing is.
 
-        Without a journal, as here, it is the `integrity_error`.
+        This default, for an outbox without a journal, is the `integrity_error`.
         """
         return self.integrity_error
 
@@ -137,13 +137,16 @@ class Outbox(ABC):
     def lag(self) -> float:
         """Age in seconds of the oldest record that the database lacks; 0.0 if none.
 
-        Without a journal, as here, it is always 0.0.
+        This default, for an outbox without a journal, is always 0.0.
         """
         return 0.0
 
     @property
     def is_drained(self) -> bool:
-        """Whether the database has taken every record; without a journal, as here, always True."""
+        """Whether the database has taken every record.
+
+        This default, for an outbox without a journal, is always True.
+        """
         return True
 
     # What the engine records
@@ -235,7 +238,7 @@ class Outbox(ABC):
     def sync(self, seconds: float | None = None) -> None:  # noqa: B027  # a default
         """Wait until everything that was recorded so far is on the disk.
 
-        Without a journal, as here, this does nothing.
+        This default, for an outbox without a journal, does nothing.
 
         Parameters
         ----------
@@ -252,7 +255,7 @@ class Outbox(ABC):
     def drain(self) -> None:  # noqa: B027  # a default
         """Wait until the database has taken everything recorded so far, at most `limit` seconds.
 
-        Without a journal, as here, this does nothing.
+        This default, for an outbox without a journal, does nothing.
 
         Raises
         ------
@@ -283,7 +286,8 @@ class Outbox(ABC):
     def request_label_drain(self) -> bool:
         """If the database lacks a label, ask that all records be copied there now; do not wait.
 
-        Return whether it lacks a label; without a journal, as here, always False.
+        Return whether it lacks a label. This default, for an outbox without a journal, only returns
+        False.
         """
         return False
 
@@ -291,8 +295,8 @@ class Outbox(ABC):
         """Return (decision id, label number) of each label that was drained since the last call.
 
         They are in the order in which they were drained. A report that repeats a stored label has
-        the number of that label. A label that the store refused has no pair. Without a product, or
-        without a journal, as here, the list is empty.
+        the number of that label. A label that the store refused has no pair. Without a product the
+        list is empty. This default, for an outbox without a journal, always returns [].
         """
         return []
 
@@ -327,8 +331,8 @@ class Outbox(ABC):
     def find_earlier(self, decision_id: str) -> StoredDecision | None:
         """Return the decision that an id already has, or None if the id is new.
 
-        It comes with its label if that is on disk. Without a journal, as here, this is
-        `find_decision`.
+        It comes with its label if that is on disk. This default, for an outbox without a journal,
+        is `find_decision`.
 
         Raises
         ------
@@ -341,21 +345,23 @@ class Outbox(ABC):
     def load_ids(self) -> None:  # noqa: B027  # a default
         """Load the ids of all decisions, so that a new id is recognized without the database.
 
-        Another call does nothing, nor does any without a journal, as here. Raise StoreError if the
-        database cannot be read.
+        Another call does nothing. Raise StoreError if the database cannot be read. This default,
+        for an outbox without a journal, does nothing.
         """
 
     def evict_decision(self, decision_id: str) -> None:  # noqa: B027  # a default
         """Drop a decision from memory, so that it is read from the database again.
 
-        What the database lacks is not dropped. Without a journal, as here, this does nothing.
+        What the database lacks is not dropped. This default, for an outbox without a journal, does
+        nothing.
         """
 
     def call_store(self, call: Callable[[], T]) -> T:
         """Run a call of the store, and return its result within `limit` seconds.
 
         Raise StoreError if the store is unavailable or takes too long, and whatever `call` raises.
-        Without a journal, as here, the call is made in this thread, without a time limit.
+        This default, for an outbox without a journal, makes the call in this thread and has no time
+        limit.
         """
         return call()
 
@@ -384,7 +390,7 @@ class Outbox(ABC):
     def wait_for_result(self, future: Future[T]) -> T:
         """Return the result of a future of `store_version`, or raise what the commit raised.
 
-        Without a journal, as here, there is no time limit.
+        This default, for an outbox without a journal, has no time limit.
 
         Raises
         ------

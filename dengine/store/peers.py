@@ -92,7 +92,8 @@ def check_peer_settings(
 def _embedding_settings(settings: Mapping[str, str]) -> dict[str, Any]:
     """Return the settings on which an embedding depends, by name, of a cell's stored settings.
 
-    Those that are not stored are None; the recipe must be.
+    They are those in EMBEDDING, seed, trace, model and described. Those that are not stored are
+    None; the recipe must be. Raise SettingError for a recipe that cannot be read.
     """
     recipe = Recipe.from_toml(settings["recipe"])
     of_recipe = {key: getattr(recipe, key) for key in EMBEDDING}

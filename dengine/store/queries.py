@@ -104,7 +104,10 @@ class Scope:
         return connection.execute(query).scalar() or 0
 
     def newest_version(self, connection: sa.Connection) -> int:
-        """Return the number of the newest version that was put in force; 0 before the first."""
+        """Return the number of the newest version that was put in force; 0 before the first.
+
+        If the cell has a product, the versions of all cells of the product count.
+        """
         return self.newest(connection, VERSION.c.version, VERSION.c.accepted == sa.true())
 
 
