@@ -36,7 +36,8 @@ def without_password(text: str) -> str:
     """Return a text in which *** stands for every password of a database URL.
 
     Two forms are masked, `scheme://user:***@host` and `password=***`, also with the names passwd
-    and sslpassword.
+    and sslpassword. In the second form the password ends before a blank, a quote or "&", so one in
+    quotes is not masked. The rest of the text stays.
     """
     return PASSWORD.sub(rf"\1={MASK}", URL.sub(rf"\1:{MASK}@", text))
 
@@ -44,8 +45,8 @@ def without_password(text: str) -> str:
 def shortened(value: Any) -> str:
     """Return the `repr` of a value for a message.
 
-    If it is longer than 60 characters, its middle is cut out. A container shows only its first
-    items, each of them cut like this.
+    If it is longer than 60 characters, "..." stands for its middle. A container shows only its
+    first items (six of a list or tuple, four of a dict), each of them cut like this.
     """
     return _REPR.repr(value)
 
@@ -53,7 +54,7 @@ def shortened(value: Any) -> str:
 def listed(names: Iterable[Any]) -> str:
     """Return the first eight names, joined by commas, and how many more there are, for a message.
 
-    Each name is cut to 100 characters.
+    So ten names end in "and 2 more". Each name is cut to 100 characters. Without names it is "".
     """
     names = list(names)
     first = ", ".join(str(name)[:100] for name in names[:8])
@@ -86,7 +87,10 @@ def as_options(text: str) -> str:
 
 
 def percent(share: float, form: str = ".1f") -> str:
-    """Return a share as text, 0.123 as "12.3 %", and NaN as "-"."""
+    """Return a share as text, 0.123 as "12.3 %", and NaN as "-".
+
+    `form` is Python's format of the number in percent, by default with one decimal.
+    """
     return "-" if math.isnan(share) else f"{100 * share:{form}} %"
 
 
@@ -94,7 +98,8 @@ def outward(lower: float, upper: float, digits: int) -> tuple[float, float]:
     """Return an interval with the lower end rounded down and the upper end rounded up, to `digits`.
 
     So 0.8999 is shown as 0.89 with two digits, and does not seem to reach a threshold of 0.9. Both
-    ends are first rounded to nine further digits, so that errors of floats do not count.
+    ends are first rounded to nine further digits, so that errors of floats do not count. `digits`
+    are those behind the point. Raise ValueError for NaN and OverflowError for an infinite end.
     """
     scale = 10**digits
     return math.floor(round(lower * scale, 9)) / scale, math.ceil(round(upper * scale, 9)) / scale
@@ -106,7 +111,11 @@ def counted(n: int, noun: str) -> str:
 
 
 def amount(value: float) -> str:
-    """Return a cost of 0 or more as text: three significant digits, and whole from 1,000 on."""
+    """Return a cost of 0 or more as text: three significant digits, and whole from 1,000 on.
+
+    So 12.34 becomes "12.3" and 1234.5 "1,234". Zeros at the end of decimals are left out, 12.0
+    becomes "12", and a cost below 0.0001 is written like "1e-05".
+    """
     return f"{value:,.0f}" if value >= 999.5 else f"{value:.3g}"
 
 
@@ -165,8 +174,8 @@ def expect(
     actual : object
         What came. The message has its `repr`, cut to 60 characters.
     do : str
-        What the user can do about it.
-    error : type
+        What the user can do about it; "" leaves it out of the message.
+    error : type, default SettingError
         Class of the error that is raised. Its message is "Expected `wanted`, got `actual`; `do`."
     """
     if not valid:

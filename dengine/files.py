@@ -65,7 +65,7 @@ def read_key(path: FilePath, error: type[DengineError]) -> bytes:
 def check_size(size: float, source: object) -> None:
     """Raise DataError if arrays would need too much memory.
 
-    The limit is 8 GB, or half of the machine's memory if that is known and less.
+    The limit is 8 GiB, or half of the machine's memory if that is known and less.
 
     Parameters
     ----------
@@ -129,6 +129,7 @@ def read_archive(
     Returns
     -------
     arrays : dict of str to array
+        By name, without the ending .npy of its member, in the order of the archive.
     all_names : list of str
         Names of all arrays in the archive, read or not, in its order.
 
@@ -173,8 +174,9 @@ def is_database(path: Path) -> bool:
 def toml_value(value: Any) -> str:
     """Return a text, a number, a boolean, or a list or tuple of these, as TOML writes it.
 
-    NumPy's numbers are numbers, too. Another object is written as a quoted text, its `str`. TOML
-    has no None, so the caller must replace it.
+    NumPy's numbers are numbers, too. NaN and infinity become nan and inf. Another object is written
+    as a quoted text, its `str`. So is None, as "None": TOML has no None, and the caller must
+    replace it.
     """
     if isinstance(value, np.generic):
         value = value.item()

@@ -56,7 +56,8 @@ def backup_store(url: FilePath, out: FilePath) -> BackupReport:
     Engines may run meanwhile: every decision, label and event that was on disk when this was called
     is in the copy. Damaged records of a journal are left out, and a record that contradicts the
     copy, or that its database refuses, becomes an event of kind "dead letter" there, which is also
-    logged. The copy is written in full or not at all. The store and the journals are only read.
+    logged. The copy is written in full or not at all; it is not in WAL mode. The store and the
+    journals are only read, but a store that is not in WAL mode is set to it (`reading`).
 
     Parameters
     ----------
@@ -128,7 +129,8 @@ def restore_store(copy: FilePath, store: FilePath) -> tuple[CellHistory, ...]:
     Parameters
     ----------
     copy : str or path
-        What `backup_store` wrote. It is checked in full, and only read.
+        What `backup_store` wrote. It is checked in full, and its rows are only read, but the file
+        is set to WAL mode if it can be written.
     store : str or path
         A file that does not exist yet.
 

@@ -441,7 +441,8 @@ class Database:
     def has_entry(self, number: int, digest: str) -> bool:
         """Return whether the cell's ledger has an entry with this number and hexadecimal digest.
 
-        Raise StoreError if the database fails.
+        The records that wait in the outbox are written first. Raise StoreError if the database
+        fails.
         """
         rows = self.read(
             sa.select(LEDGER.c.digest).where(self.own(LEDGER), LEDGER.c.number == number)
@@ -616,6 +617,7 @@ class Database:
 
         If another thread is writing: with `waiting` this waits until it has finished; without, it
         returns at once, and that thread disconnects when it has finished. SQLite in memory is lost.
+        Records that wait in the outbox are not written. A second call changes nothing.
         """
         self._closed = True
         if self._writing.acquire(blocking=waiting):

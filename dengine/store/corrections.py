@@ -48,7 +48,8 @@ class CorrectionTable(CellTable):
         The change may correct labels, or have them forgotten (they count nowhere any more), store a
         model version, and replace the engine's settings. An accepted version deletes the stored
         arrays of older versions that are not kept any more. If one of these fails, nothing is
-        written. A label that already has the new value gets a correction, too.
+        written. A label that already has the new value gets a correction, too. An id that is given
+        twice gets one correction. If nothing is to be changed, only the event is committed.
 
         Raises
         ------

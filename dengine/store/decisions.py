@@ -306,7 +306,8 @@ class DecisionTable(CellTable):
         Returns
         -------
         list of Stretch
-            Sorted by their newest decision.
+            Sorted by their newest decision; [] without decisions. Bad accepted parts are counted by
+            their labels after corrections.
         """
         if seconds:
             stretch: sa.ColumnElement[Any] = sa.func.floor((DECISION.c.time - start) / seconds)

@@ -47,7 +47,7 @@ class Drainer:
     Attributes
     ----------
     n_drained : int
-        Number of records that the database has.
+        Number of records that the database has, of those recorded since the opening.
     """
 
     def __init__(
@@ -163,7 +163,8 @@ class Drainer:
         Raises
         ------
         StoreError
-            If the store cannot be used now (there is a `fault`); the call is then not made.
+            If the store cannot be used now (there is a `fault`); the call is then not made. A call
+            that is submitted after the thread has ended is not made either, without an error here.
         """
         future: Future[T] = Future()
         with self._changed:

@@ -46,8 +46,10 @@ class RecordInsertion:
         """Commit records in one transaction; return (decision id, label number) of their labels.
 
         A record that is stored already changes nothing, except that a label has its pair. A record
-        that contradicts the store becomes a dead letter, an event that says what was in it, and is
-        logged. A late stop (`_is_late_stop`) corrects the label of its part. If the database
+        that contradicts the store, like another label of a labelled decision, or a label whose
+        decision is not stored, becomes a dead letter: an event that says what was in it, and that
+        is logged. A late stop (`_is_late_stop`) corrects the label of its part to failure, with an
+        event, and has its pair. A label of a quarantined trace is quarantined. If the database
         refuses a value, the records are halved, each half in a transaction of its own, until the
         refused record is alone; it becomes a dead letter, too. A label that became a dead letter
         has no pair. Raise StoreError if the database fails in another way; halves that were
@@ -209,7 +211,8 @@ def _is_late_stop(label: NewLabel, first: Any) -> bool:
 def _differences(item: StoredDecision, row: Any) -> list[str]:
     """Return the names of the columns in which a decision and its stored row differ.
 
-    The row must have the columns of the decision and of its trace. The number is not compared.
+    The row must have the columns of the decision and of its trace. The number is not compared. []
+    if they are equal.
     """
     given = decision_row(item) | trace_row(item)
     return [name for name, value in given.items() if row._mapping[name] != value]

@@ -73,8 +73,9 @@ def encode_record(record: Record) -> bytes:
     """Return a record (decision, label or event) as bytes.
 
     They are the length of a JSON text, this text with the record's kind and fields, and the float32
-    values of a decision's trace or of a label's `point`, the embedding of the trace. The mark,
-    length, checksum and digest that stand before each record in a journal are not included.
+    values of a decision's trace or of a label's `point`, the embedding of the trace. The number
+    and the label of a decision are left out, and so are the mark, length, checksum and digest that
+    stand before each record in a journal.
     """
     if isinstance(record, StoredDecision):
         row = decision_row(record) | {"shape": record.trace.shape}
@@ -89,7 +90,8 @@ def encode_record(record: Record) -> bytes:
 def decode_record(blob: bytes) -> Record:
     """Return the record that `encode_record` wrote; raise StoreError for bytes that have no record.
 
-    A changed number or sample is not noticed here; the journal checks for that.
+    A decision has number 0 and no label. A changed number or sample is not noticed here; the
+    journal checks for that.
     """
     with instead(
         StoreError,
@@ -110,7 +112,9 @@ def decode_record(blob: bytes) -> Record:
 
 @dataclass
 class Head:
-    """What the small file beside a journal says; by default that of an earlier release.
+    """What the head, the small file beside a journal, says.
+
+    The default values stand for a head that is missing or damaged.
 
     Attributes
     ----------
@@ -539,7 +543,8 @@ def journal_path(url: Any, cell_id: str) -> Path:
     Path
         Beside an SQLite file, links resolved, STORE.CELL.journal. For a server CELL.DIGEST.journal
         in the folder dengine of the user's state folder (`XDG_STATE_HOME`, or ~/.local/state), with
-        the first 60 characters of the cell and a digest of the server, the database and the cell.
+        the first 60 characters of the escaped cell, and 12 hexadecimal digits of a digest of the
+        server with its port, the database and the cell.
     """
     name = urllib.parse.quote(cell_id, safe="")
     if IGNORES_CASE:  # or cell A and cell a would have one journal
@@ -562,17 +567,18 @@ def sqlite_file(url: Any) -> Path:
 
 
 def head_path(journal: Path) -> Path:
-    """Return the path of the head, the small file beside a journal."""
+    """Return the path of the head, the small file beside a journal: its name with ".head" added."""
     return journal.with_name(f"{journal.name}.head")
 
 
 def read_undrained(path: Path) -> tuple[list[Record], Journal]:
     """Return the records of a journal that its store has not taken, and the journal, closed.
 
-    The records are those of `Journal.decode_undrained`. Nothing is locked or changed, so an engine
-    may be using the journal. Raise StoreError if the file cannot be opened or is no journal, and
-    for an intact record that cannot be decoded, like that of another release of dengine. If the
-    disk fails later, while the records are read, OSError is raised.
+    The records are those of `Journal.decode_undrained`; the journal's attribute `loss` says which
+    are missing or damaged. Nothing is locked or changed, so an engine may be using the journal.
+    Raise StoreError if the file cannot be opened or is no journal, and for an intact record that
+    cannot be decoded, like that of another release of dengine. If the disk fails later, while the
+    records are read, OSError is raised.
     """
     journal = Journal(path, owning=False)
     try:
@@ -592,7 +598,10 @@ def read_head(journal: Path) -> Head:
 
 
 def _parse_header(header: bytes) -> dict[str, Any]:
-    """Return the fields of a header by name; raise one of the types in DAMAGES if it is damaged."""
+    """Return the fields of a header by name; raise one of the types in DAMAGES if it is damaged.
+
+    A header without `n_drained`, of an earlier release, gets 0.
+    """
     return {"n_drained": 0} | _unpack_fields(header[len(MAGIC) :])
 
 

@@ -147,18 +147,28 @@ class JournalledStore(Outbox):
 
     @property
     def verify_all_reason(self) -> str:
+        """Why every part must be verified: `integrity_error`, or why the disk takes no records.
+
+        "" if neither. A database that does not answer is no such reason.
+        """
         return self.integrity_error or self._recorder.fault
 
     @property
     def fault(self) -> str:
+        """What is wrong with journal or database at present: `integrity_error`, or why one fails.
+
+        Also that the database is too far behind (`Drainer.fault`). "" if nothing is wrong.
+        """
         return self.integrity_error or self._drainer.fault
 
     @property
     def lag(self) -> float:
+        """Age in seconds of the oldest record that the database lacks; 0.0 if it lacks none."""
         return self._drainer.lag
 
     @property
     def is_drained(self) -> bool:
+        """Whether the database has every record."""
         return self._drainer.is_drained
 
     # What the engine records
@@ -166,9 +176,9 @@ class JournalledStore(Outbox):
     def record_decision(self, item: StoredDecision) -> StoredDecision:
         """Record a decision in memory, return a copy with its number; a thread writes it to disk.
 
-        The number is the cell's next one. If its id has a decision in memory, that decision is
-        returned, and nothing is recorded. That a new id has no decision in the database is not
-        checked.
+        The number is the cell's next one. If one of the newest 1,000 decisions has this id, that
+        decision is returned, and nothing is recorded. That an older decision has the id is not
+        checked. `find_decision` finds the new decision at once.
         """
         id_ = item.decision.id
         with self._changed:
@@ -203,25 +213,37 @@ class JournalledStore(Outbox):
         """Record copies of labels in memory, for a thread to write to the journal.
 
         `labels` holds pairs of a decision and its label. Each copy gets the present time, and the
-        content hash and time of its decision.
+        content hash and time of its decision. That a decision has a label already is not checked.
         """
         with self._changed:
             for item, label in labels:
                 self._index.add(self._recorder.record(self._completed(item, label)))
 
     def record_event(self, kind: str, text: str) -> None:
+        """Record an event with the present time in memory; a thread writes it to disk."""
         self._recorder.record_event(kind, text)
 
     def sync(self, seconds: float | None = None) -> None:
+        """Have all records so far written to the disk, and wait for it, at most `seconds`.
+
+        None: `limit` seconds. If all are there, this returns at once. Raise NotTakenError if that
+        takes longer, or a write fails meanwhile; the thread tries to write the records again.
+        """
         self._recorder.sync(seconds)
 
     def drain(self) -> None:
+        """Have all records so far copied to the database, and wait for it, at most `limit` seconds.
+
+        Raise StoreError if that takes longer, or the disk or the database has a fault; the records
+        are copied later.
+        """
         self._drainer.drain()
 
     def request_label_drain(self) -> bool:
         """Return whether the database still lacks a label; if so, have all records copied there.
 
-        Threads write them to the disk and copy them, and are not waited for.
+        Threads write them to the disk and copy them, at once, and are not waited for. If only
+        decisions or events are missing there, this does nothing.
         """
         with self._changed:
             if self._index.has_undrained_labels:
@@ -229,6 +251,12 @@ class JournalledStore(Outbox):
             return self._index.has_undrained_labels
 
     def pop_label_numbers(self) -> LabelNumbers:
+        """Return (decision id, label number) of each label that was drained since the last call.
+
+        They are in the order in which they were drained. A report that repeats a stored label has
+        the number of that label, and a label that became a dead letter has no pair. Without a
+        product the list is empty.
+        """
         return self._drainer.pop_label_numbers()
 
     # What the engine asks
@@ -300,18 +328,39 @@ class JournalledStore(Outbox):
                     self._changed.wait_for(lambda: self._closed, RETRY_SECONDS)
 
     def evict_decision(self, decision_id: str) -> None:
+        """Drop a decision from the newest in memory, so that it is read from the database again.
+
+        A decision or label that the database lacks stays in memory. An unknown id changes nothing.
+        """
         with self._changed:
             self._index.recent.pop(decision_id, None)
 
     def call_store(self, call: Callable[[], T]) -> T:
+        """Make a call in the thread that uses the database, and return its result.
+
+        Before the call, the thread copies the records that are on disk to the database. Raise what
+        the call raises, and StoreError if the store has a fault (the call is then not made) or
+        takes longer than `limit` seconds (`Drainer.wait_for_result`).
+        """
         return self.wait_for_result(self._drainer.submit(call))
 
     def store_version(
         self, report: RetrainReport, last_seq: int, state: Arrays | None
     ) -> Future[int]:
+        """Have the thread that uses the database commit a retrain (`VersionTable.put`).
+
+        It is not waited for: return a future of the version's number, for `wait_for_result`, which
+        also raises what the commit raises. The arrays are not copied here, so do not change them
+        until then. Raise StoreError if the store has a fault; nothing is committed then.
+        """
         return self._drainer.submit(lambda: self.store.versions.put(report, last_seq, state))
 
     def wait_for_result(self, future: Future[T]) -> T:
+        """Return the result of a future of `store_version`, or raise what its commit raised.
+
+        Raise StoreError if it takes longer than `limit` seconds. The commit is then cancelled,
+        unless it is under way (`Drainer.wait_for_result`).
+        """
         return self._drainer.wait_for_result(future)
 
     def close(self) -> None:

@@ -38,7 +38,9 @@ from .views import PastLabel
 
 
 class LabelTable(CellTable):
-    """Reads labels. What is not as it was stored is left out, and an event says so.
+    """Reads labels.
+
+    `with_traces` and `past` leave out what is not as it was stored, and an event says so.
 
     Parameters
     ----------
@@ -160,7 +162,8 @@ class LabelTable(CellTable):
 
         Labels of quarantined traces, which no version is trained on, are included, and so are
         forgotten ones. A label that is not as it was stored is left out, and an event with the id
-        of its decision is written to the store, or logged if the store cannot be written.
+        of its decision is written to the store, or logged if the store cannot be written. A label
+        without its decision is left out, too, without an event.
 
         Parameters
         ----------
@@ -204,7 +207,7 @@ class LabelTable(CellTable):
         training), and labels of rejected parts (`Source.INSPECTION`), because somebody chooses
         which of these parts come back. Only this cell's labels count: labels of other cells are no
         evidence for this one, and a drift detector that counts them would notice too late that this
-        cell has changed.
+        cell has changed. Whether labels and decisions are as they were stored is not checked here.
 
         Parameters
         ----------

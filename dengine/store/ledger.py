@@ -121,7 +121,9 @@ _DOUBLE = struct.Struct(">d").pack
 def is_intact(table: sa.Table, values: Sequence[Any]) -> bool:
     """Return whether the stored sum of a row is the one that its values have now.
 
-    `values` are those of the table's columns, in their order; what follows them is ignored.
+    `values` are those of the table's columns, in their order; what follows them is ignored. False
+    for a row of None alone, like that of an outer join without a match. Raise TypeError for a value
+    that `row_sum` refuses.
     """
     row = dict(zip(table.c.keys(), values, strict=False))
     return bool(row_sum(table.name, row) == row["sum"])
@@ -133,7 +135,7 @@ def state_sum(state: bytes | None) -> bytes | None:
 
 
 def ledger_key() -> bytes:
-    """Return the key from the file that DENGINE_LEDGER_KEY names; b"" if the variable is not set.
+    """Return the key from the file that DENGINE_LEDGER_KEY names; b"" if it is not set or empty.
 
     Raise StoreError if the file cannot be read or holds fewer than 16 bytes.
     """
@@ -305,6 +307,10 @@ class LedgerEntry:
     def append(self, clock: Clock) -> EntryName | None:
         """Insert the entry into the ledger, as the transaction's last step; this does not commit.
 
+        The entry has the numbers of the added rows by table, a digest over their checksums, the
+        chains of the tables in `IN_FORCE` extended by them, and a digest over all this and the
+        entry before. If settings were written, it also has a copy of all settings of the engine.
+
         Parameters
         ----------
         clock : callable
@@ -439,9 +445,9 @@ def _find_table_error(
 
 
 def chain_writes(engine: sa.Engine) -> None:
-    """Have an engine call `_chain_statement` before every statement.
+    """Have an SQLAlchemy engine call `_chain_statement` before every statement.
 
-    The function gives inserted rows their sums, and adds these to the ledger's next entry.
+    That gives inserted rows their sums, and adds these to the ledger entry of the transaction.
     """
     sa.event.listen(engine, "before_execute", _chain_statement, retval=True)
 

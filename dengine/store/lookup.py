@@ -43,7 +43,8 @@ class DecisionIndex:
         """Add a record that was just recorded; an event, which has no id, changes nothing.
 
         `entry` holds the record. It replaces an earlier decision of that id, or an earlier label of
-        that decision. The oldest of more than N_RECENT decisions (1,000) leaves `recent`.
+        that decision. The oldest of more than N_RECENT decisions (1,000) leaves `recent`; one that
+        is replaced counts as old as it was.
         """
         record = entry.record
         if isinstance(record, StoredDecision):
@@ -57,7 +58,10 @@ class DecisionIndex:
             self._labels[record.decision_id] = entry
 
     def is_replaced(self, entry: Entry) -> bool:
-        """Return whether a later record of the same decision replaces this undrained one."""
+        """Return whether a later record of the same decision replaces this undrained one.
+
+        False for a label or an event.
+        """
         record = entry.record
         return (
             isinstance(record, StoredDecision)
@@ -68,8 +72,9 @@ class DecisionIndex:
         """Remove a record that the database has now.
 
         `entry` holds the record. The newest N_RECENT decisions (1,000) stay in `recent`. If the
-        record is a label, its decision there is replaced by a copy with the label. Raise KeyError
-        for a label that was not added.
+        record is a label, its decision there is replaced by a copy with the label, without the
+        label's number and time. An event, and a decision that a later record replaces, change
+        nothing. Raise KeyError for a label that was not added.
         """
         record = entry.record
         if isinstance(record, StoredDecision) and not self.is_replaced(entry):
@@ -108,7 +113,10 @@ class DecisionIndex:
         return item, label
 
     def is_unsynced(self, decision_id: str) -> bool:
-        """Return whether a decision was recorded, and is not in the journal yet."""
+        """Return whether a decision was recorded, and is not synced in the journal yet.
+
+        False for an unknown id, and for a decision that the database has.
+        """
         entry = self._decisions.get(decision_id)
         return entry is not None and not entry.is_synced
 
@@ -125,5 +133,5 @@ class DecisionIndex:
         return self.has_all_ids and hash(decision_id) not in self._hashes
 
     def add_ids(self, ids: Sequence[str]) -> None:
-        """Add ids of decisions that the database has."""
+        """Add the hashes of ids of decisions that the database has; `is_new` is False for them."""
         self._hashes.update(map(hash, ids))

@@ -52,9 +52,9 @@ class MemoryStore(Outbox):
     def _write(self) -> None:
         """Write the model versions and the records that wait in memory to the database.
 
-        It is called before each use of the store, and when 40 versions wait. The versions are
-        written first. Raise StoreError if the database cannot be written; what was not written by
-        then is lost.
+        It is called before each use of the store, when 40 versions wait, and after each event of an
+        engine that only reads. The versions are written first. Raise StoreError if the database
+        cannot be written; what was not written by then is lost.
         """
         versions = self._versions
         records = self._unwritten

@@ -121,23 +121,32 @@ class Outbox(ABC):
     def verify_all_reason(self) -> str:
         """Why every part must be verified: an integrity error, or a journal that cannot be written.
 
-        "" if neither.
+        "" if neither. This default, for an outbox without a journal, is the `integrity_error`.
         """
         return self.integrity_error
 
     @property
     def fault(self) -> str:
-        """What is wrong with the store or the journal at present; "" if nothing is."""
+        """What is wrong with the store or the journal at present; "" if nothing is.
+
+        This default, for an outbox without a journal, is the `integrity_error`.
+        """
         return self.integrity_error
 
     @property
     def lag(self) -> float:
-        """Age in seconds of the oldest record that the database lacks; 0.0 if none."""
+        """Age in seconds of the oldest record that the database lacks; 0.0 if none.
+
+        This default, for an outbox without a journal, is always 0.0.
+        """
         return 0.0
 
     @property
     def is_drained(self) -> bool:
-        """Whether the database has taken every record."""
+        """Whether the database has taken every record.
+
+        This default, for an outbox without a journal, is always True.
+        """
         return True
 
     # What the engine records
@@ -154,8 +163,9 @@ class Outbox(ABC):
         Returns
         -------
         StoredDecision
-            A copy of `item` with its number. If the id already has a decision in memory, that
-            decision is returned, and nothing is recorded.
+            A copy of `item` with its number, the cell's next one. If one of the newest 1,000
+            decisions of a `JournalledStore` has the same id, that decision is returned, and nothing
+            is recorded; a `MemoryStore` does not check this.
         """
 
     def replace_decision(self, item: StoredDecision) -> StoredDecision:
@@ -228,6 +238,8 @@ class Outbox(ABC):
     def sync(self, seconds: float | None = None) -> None:  # noqa: B027  # a default
         """Wait until everything that was recorded so far is on the disk.
 
+        This default, for an outbox without a journal, does nothing.
+
         Parameters
         ----------
         seconds : float or None
@@ -243,7 +255,7 @@ class Outbox(ABC):
     def drain(self) -> None:  # noqa: B027  # a default
         """Wait until the database has taken everything recorded so far, at most `limit` seconds.
 
-        In memory nothing is waited for.
+        This default, for an outbox without a journal, does nothing.
 
         Raises
         ------
@@ -274,7 +286,8 @@ class Outbox(ABC):
     def request_label_drain(self) -> bool:
         """If the database lacks a label, ask that all records be copied there now; do not wait.
 
-        Return whether it lacks a label; False for a store in memory.
+        Return whether it lacks a label. This default, for an outbox without a journal, only returns
+        False.
         """
         return False
 
@@ -283,7 +296,7 @@ class Outbox(ABC):
 
         They are in the order in which they were drained. A report that repeats a stored label has
         the number of that label. A label that the store refused has no pair. Without a product the
-        list is empty.
+        list is empty. This default, for an outbox without a journal, always returns [].
         """
         return []
 
@@ -318,7 +331,8 @@ class Outbox(ABC):
     def find_earlier(self, decision_id: str) -> StoredDecision | None:
         """Return the decision that an id already has, or None if the id is new.
 
-        It comes with its label if that is on disk.
+        It comes with its label if that is on disk. This default, for an outbox without a journal,
+        is `find_decision`.
 
         Raises
         ------
@@ -331,17 +345,23 @@ class Outbox(ABC):
     def load_ids(self) -> None:  # noqa: B027  # a default
         """Load the ids of all decisions, so that a new id is recognized without the database.
 
-        Another call does nothing, nor does any for a store in memory. Raise StoreError if the
-        database cannot be read.
+        Another call does nothing. Raise StoreError if the database cannot be read. This default,
+        for an outbox without a journal, does nothing.
         """
 
     def evict_decision(self, decision_id: str) -> None:  # noqa: B027  # a default
-        """Drop a decision from memory, so that it is read from the database again."""
+        """Drop a decision from memory, so that it is read from the database again.
+
+        What the database lacks is not dropped. This default, for an outbox without a journal, does
+        nothing.
+        """
 
     def call_store(self, call: Callable[[], T]) -> T:
         """Run a call of the store, and return its result within `limit` seconds.
 
         Raise StoreError if the store is unavailable or takes too long, and whatever `call` raises.
+        This default, for an outbox without a journal, makes the call in this thread and has no time
+        limit.
         """
         return call()
 
@@ -370,6 +390,8 @@ class Outbox(ABC):
     def wait_for_result(self, future: Future[T]) -> T:
         """Return the result of a future of `store_version`, or raise what the commit raised.
 
+        This default, for an outbox without a journal, has no time limit.
+
         Raises
         ------
         StoreError
@@ -383,5 +405,5 @@ class Outbox(ABC):
     def close(self) -> None:
         """Write what can be written within seconds, and let another engine own the cell.
 
-        A second call does nothing, nor does one in a forked process.
+        With a journal a second call does nothing, nor does one in a forked process.
         """

@@ -92,7 +92,8 @@ def check_peer_settings(
 def _embedding_settings(settings: Mapping[str, str]) -> dict[str, Any]:
     """Return the settings on which an embedding depends, by name, of a cell's stored settings.
 
-    Those that are not stored are None; the recipe must be.
+    They are those in EMBEDDING, seed, trace, model and described. Those that are not stored are
+    None; the recipe must be. Raise SettingError for a recipe that cannot be read.
     """
     recipe = Recipe.from_toml(settings["recipe"])
     of_recipe = {key: getattr(recipe, key) for key in EMBEDDING}
@@ -120,7 +121,7 @@ def list_cells(url: str) -> list[CellSummary]:
     It has the cell's product, its numbers of decisions and labels, the newest version that was put
     in force in the cell or its product, and the time of the newest decision or label. Forgotten
     labels and those of quarantined traces count; records that are only in a journal do not. Raise
-    StoreError if the database is not there or is no store. Nothing is written.
+    StoreError if the database is not there or is no store. No row is written (see `reading`).
     """
     with reading(url) as connection:
         settings = connection.execute(sa.select(SETTING)).all()

@@ -104,12 +104,15 @@ class Scope:
         return connection.execute(query).scalar() or 0
 
     def newest_version(self, connection: sa.Connection) -> int:
-        """Return the number of the newest version that was put in force; 0 before the first."""
+        """Return the number of the newest version that was put in force; 0 before the first.
+
+        If the cell has a product, the versions of all cells of the product count.
+        """
         return self.newest(connection, VERSION.c.version, VERSION.c.accepted == sa.true())
 
 
 def cells_of(product: str) -> sa.Select[Any]:
-    """Return the query for the ids of a product's cells."""
+    """Return the query for the ids of a product's cells, in no order; it is not run."""
     return sa.select(SETTING.c.cell_id).where(
         SETTING.c.key == PRODUCT_KEY, SETTING.c.value == product
     )
@@ -150,8 +153,9 @@ def join_product(connection: sa.Connection, cell_id: str, product: str | None) -
     Raises
     ------
     StoreError
-        If the cell has another product, if the name is empty or not printable, and if the cell has
-        settings or labels already without a product: its labels were numbered without the others.
+        If the cell has another product. Of a cell without a product, if the name is blank or not
+        printable, and if the cell has settings or labels already: its labels were numbered without
+        those of the other cells.
     """
     stored = read_setting(connection, cell_id, PRODUCT_KEY)
     if product is None or stored == product:

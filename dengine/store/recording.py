@@ -70,7 +70,7 @@ class Recorder:
         Records that are not on disk, and those that are, oldest first; who drains the latter takes
         them out.
     n_recorded, n_synced : int
-        Numbers of records so far.
+        Numbers of records since the opening: of all, and of those that are on disk.
     needs_drain : bool
         The journal is long, and is cleared if its records are drained at once.
     """
@@ -105,7 +105,7 @@ class Recorder:
 
     @property
     def is_syncing(self) -> bool:
-        """Whether a sync is under way."""
+        """Whether the thread is writing a batch to the journal, or waits for its sync."""
         return not math.isinf(self._began)
 
     @property
@@ -133,7 +133,7 @@ class Recorder:
         return entry
 
     def record_event(self, kind: str, text: str) -> None:
-        """Add an event with the present time."""
+        """Add an event with the present time in memory, and wake the thread that writes it."""
         self.record(new_event(kind, text, self._clock()))
 
     def request_sync(self) -> None:
@@ -145,7 +145,8 @@ class Recorder:
     def sync(self, seconds: float | None = None) -> None:
         """Wait until everything recorded so far is on the disk, at most `seconds`.
 
-        None: `limit` seconds, an argument of `Recorder`. The records are written at once. Raise
+        None: `limit` seconds, an argument of `Recorder`. If everything is on disk already, this
+        returns at once; else the records are written without the usual delay. Raise
         NotTakenError if that takes longer, or a write fails meanwhile. The records are not lost
         then: the thread, unless it was stopped, tries to write them again.
         """

@@ -203,6 +203,8 @@ class NewLabel:
 class StoredDecision:
     """A decision as a store holds it, with its label.
 
+    Two are equal if all their fields but `trace` and `number` are.
+
     Attributes
     ----------
     decision : Decision
@@ -242,7 +244,7 @@ class StoredDecision:
 
     @property
     def label(self) -> str:
-        """The label in a word: good, bad or none."""
+        """The label after corrections in a word: good, bad or none; none if it was forgotten."""
         return LABEL_WORDS[self.success]
 
     def with_label(self, label: NewLabel) -> Self:
@@ -272,7 +274,11 @@ class LabelledTraces:
     hashes: Ints
 
     def rows(self) -> Iterator[tuple[int, TraceArray, int, int]]:
-        """Return the labelled traces one by one: number, trace, label and hash."""
+        """Return an iterator over the labelled traces, oldest label first.
+
+        Each item is (number of the label, trace of shape (C, T), label, content hash); all but the
+        trace are Python integers.
+        """
         lists = (self.labels.tolist(), self.hashes.tolist())
         return zip(self.seq.tolist(), self.traces, *lists, strict=True)
 
@@ -367,7 +373,9 @@ def new_event(
 ) -> Event:
     """Return an event that is not numbered yet, in texts and data that every database takes.
 
-    Raise StoreError for data that JSON does not have.
+    Its number is 0. In `kind`, `text` and `author` a NUL and half a surrogate pair become escapes;
+    `data` is copied as if it was written to JSON and read (`as_data`). Nothing is stored. Raise
+    StoreError for data that JSON does not have.
     """
     return Event(0, float(time), as_text(kind), as_text(text), as_data(data), as_text(author))
 
@@ -501,7 +509,8 @@ def address(store: FilePath, cell_id: str | None = None, product: str | None = N
     """Return a store's file or URL as text; a `CellAddress` if a cell or product is given.
 
     A `CellAddress` is a text with the attributes `cell_id` and `product`. If only a product is
-    given, the cell is named "cell".
+    given, or `cell_id` is "", the cell is named "cell". If neither is given, a `store` that is a
+    `CellAddress` already is returned unchanged; otherwise its own cell and product are replaced.
     """
     url = os.fspath(store)
     return (
@@ -534,8 +543,10 @@ def _plain_type(hint: Any) -> type:
 def to_row(record: Any, *names: str) -> Row:
     """Return the fields of a record as columns of a row, by name; only `names` if they are given.
 
-    Enumerations become text, tuples and dicts JSON, arrays packed float32. Raise ValueError or
-    TypeError for a value that cannot be converted to the type of its field.
+    Enumerations become text, tuples and dicts JSON text, arrays the bytes of float32, without their
+    shape (`pack`). None stays None, and other values are converted to the type of their field.
+    Raise ValueError or TypeError for a value that cannot be converted, and AttributeError for a
+    name that the record does not have.
     """
     record_type: Any = type(record)
     fields = columns(record_type)
@@ -562,7 +573,7 @@ def from_row(record_type: Callable[..., T], row: Mapping[str, Any], **given: Any
     ------
     StoreError
         If the row lacks a field, or a value cannot be converted to the type of its field. Fields of
-        type str, int and float take any value, unchecked.
+        type str, int and float take any value, unchecked, and every field takes None.
     """
     try:
         values = {
@@ -611,7 +622,7 @@ def _from_column(value: Any, type_: type) -> Any:
 
 
 def decision_row(item: StoredDecision) -> Row:
-    """Return the row of the table `decision` for a decision, without its number."""
+    """Return the row of the table `decision` for a decision, without number, label and trace."""
     return to_row(item.decision) | to_row(item, *OF_DECISION)
 
 
@@ -642,12 +653,15 @@ def read_decision(row: Any) -> StoredDecision:
 
 
 def pack(values: NDArray[np.float32]) -> bytes:
-    """Return the values as little-endian float32, without their shape."""
+    """Return the values as bytes of little-endian float32, in C order, without their shape."""
     return values.astype("<f4", copy=False).tobytes()
 
 
 def unpack(blob: bytes) -> NDArray[np.float32]:
-    """Return what `pack` wrote as a flat array of float32; ValueError for a part of a number."""
+    """Return what `pack` wrote as a new flat array of float32, empty for b"".
+
+    Raise ValueError if the number of bytes is no multiple of 4.
+    """
     return np.frombuffer(blob, dtype="<f4").astype(np.float32)
 
 

@@ -27,7 +27,7 @@ class RuleProgress:
         until its label comes), the stored state is incomplete, or the version was made under an
         earlier policy or by another cell of the product.
     overdue_to : int
-        Number of the newest decision whose check was overdue.
+        Up to this decision number a check without a label is overdue; 0: none is.
     overdue_ids : frozenset of str
         Ids of the decisions whose overdue checks the rule includes as errors.
     """

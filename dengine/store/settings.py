@@ -19,15 +19,19 @@ class SettingTable(CellTable):
     """
 
     def read(self) -> dict[str, str]:
-        """Return the settings that were saved last, by key; {} for a new store."""
+        """Return the settings that were saved last, by key; {} for a new cell.
+
+        Those that the store itself keeps (`RESERVED`) are left out.
+        """
         with self._database.reading() as connection:
             return read_settings(connection, self._database.cell_id)
 
     def save(self, settings: Mapping[str, str]) -> None:
         """Commit new settings in the place of all present ones.
 
-        Raise SettingError if those of another cell of the product contradict them, and StoreError
-        for a key that the store itself keeps (`RESERVED`); then nothing is changed.
+        The settings that the store itself keeps (`RESERVED`) stay. Raise SettingError if those of
+        another cell of the product contradict them, or a recipe of the two cannot be read, and
+        StoreError for a key in `RESERVED` and if the database fails; then nothing is changed.
         """
         self._database.write(lambda connection: self.replace(connection, settings))
 

@@ -71,8 +71,9 @@ class SqlStore(AbstractContextManager["SqlStore"]):
     Raises
     ------
     StoreError
-        For a setting that is not valid, and for what `Database` refuses. Every method raises it if
-        the database fails.
+        For an empty `cell_id`, a `keep_versions` below 2, a `wait` that is not above 0 or not
+        finite, a `product` of a store in memory, and for what `Database` refuses. Every method
+        raises it if the database fails.
 
     Notes
     -----
@@ -184,7 +185,8 @@ class SqlStore(AbstractContextManager["SqlStore"]):
     def close(self) -> None:
         """Disconnect from the database; a store in memory stays open.
 
-        If an engine claimed the cell, its journal is closed, too, and another engine can own it.
+        If an engine claimed the cell, its journal is closed, too, and another engine can own it. A
+        second call changes nothing.
         """
         if not self.database.is_in_memory:
             self.database.close()
@@ -192,6 +194,7 @@ class SqlStore(AbstractContextManager["SqlStore"]):
             self._journal.close()
 
     def __exit__(self, *exception: object) -> None:
+        """Close the store (`close`); an exception of the block passes unchanged."""
         self.close()
 
 

@@ -161,6 +161,7 @@ def verify_history(
         The cell; None: all cells.
     expect : str or None
         A digest of an earlier check, or its first 8 digits or more, that the history must contain.
+        Capital letters and blanks around it do not matter.
     on_rows : callable, optional
         Called with the number of rows that were just read, for a progress bar: after each 500, and
         at the end of each cell with the rest, which may be 0.
@@ -253,7 +254,10 @@ def _selected_cells(connection: sa.Connection, cell_id: str | None) -> list[str]
 
 
 class CellCheck:
-    """The check of one cell's history.
+    """The check of one cell's history; `run` makes it, once.
+
+    To make a `CellCheck` reads the ledger's key from the file that DENGINE_LEDGER_KEY names, and
+    raises StoreError if that cannot be read.
 
     Parameters
     ----------

@@ -110,10 +110,11 @@ class VersionTable(CellTable):
     def insert(self, connection: sa.Connection, row: Row) -> int:
         """Insert the row of a retrain; return the number of its version. Nothing is committed.
 
-        If the version is not put in force (`accepted` of the row is False), it keeps its number and
-        nothing else is done. Otherwise it gets the next number if another cell of the product has
-        taken its number, and the states of older versions of cell and product that `keeps_state`
-        does not keep are deleted. The product is then locked until the transaction ends.
+        The retrain gets the next number of the cell or its product; the product is then locked
+        until the transaction ends. If the version is not put in force (`accepted` of the row is
+        False), it keeps its number, and nothing else is done. Otherwise it gets the number after
+        the product's newest version if another cell of the product has taken its number, and the
+        states of older versions of cell and product that `keeps_state` does not keep are deleted.
         """
         number: int = row["version"]
         if row["accepted"]:
@@ -146,9 +147,9 @@ class VersionTable(CellTable):
     def newest(self) -> ModelVersion | None:
         """Return the newest version that was put in force in the cell or its product.
 
-        It comes with its arrays. If they are missing or damaged, an event is written to the store,
-        or logged if the store cannot be written, and the next older version whose arrays are kept
-        and intact is returned.
+        It comes with its arrays. If they are missing or damaged, an event is written to the store
+        (once for each such version), or logged if the store cannot be written, and the next older
+        version whose arrays are kept and intact is returned.
 
         Returns
         -------

@@ -45,7 +45,8 @@ class HistoryFilter:
     Raises
     ------
     SettingError
-        For a value that a field cannot have.
+        For an action, predicted action, reason or label that does not exist. The other fields are
+        not checked.
     """
 
     action: str | None = None
@@ -57,7 +58,7 @@ class HistoryFilter:
     part: str | None = None
 
     def __post_init__(self) -> None:
-        """Raise SettingError for a value that is not valid."""
+        """Raise SettingError for an action, predicted, reason or label that is not in OPTIONS."""
         for name, options in OPTIONS.items():
             value = getattr(self, name)
             is_valid = value is None or value in options
