@@ -212,9 +212,10 @@ class LabelReader:
 
 
 def as_key(word: str) -> str:
-    """Return a word as a key of a listing: without leading zeros in a number, with / in a path.
+    """Return a word as a key of a listing, so that keys are equal if they mean the same.
 
-    Excel writes a text as `="0012"`. The names of files are compared in small letters.
+    A number loses its leading zeros, a backslash becomes `/`, and a word with a file's suffix is
+    put in small letters. `="0012"`, as Excel writes a text, is read as `0012`.
     """
     word = word.removeprefix("=").strip('"')
     word = word.lower() if SUFFIX.search(word) else word

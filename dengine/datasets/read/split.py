@@ -76,12 +76,15 @@ def signals_of(description: Description) -> Sequence[str]:
 
 
 def verdicts_of(description: Description) -> set[str]:
-    """Return the topics of a bag that hold labels."""
+    """Return the topics of a bag that hold labels, of `[label]` and `[[check]]`; empty without."""
     return {source.topic for source in description.labels} - {""}
 
 
 def pattern_of(column: str, any_text: str = ".*") -> re.Pattern[str]:
-    """Return the pattern of a channel's columns, in which `*` stands for any text."""
+    """Return the pattern of a channel's columns, in which `*` stands for any text.
+
+    `any_text` is the regular expression that replaces each `*`. The pattern is for `fullmatch`.
+    """
     return re.compile(any_text.join(map(re.escape, column.split(ANY))), re.DOTALL)
 
 
