@@ -168,21 +168,26 @@ class UrCell(AbstractContextManager["UrCell"]):
         return self.last.trace
 
     def verify(self) -> bool:
-        """Have the part measured; return whether it is good. A bad part goes back to the bin.
+        """Have the part measured, wait for that, and return whether it is good.
 
+        A bad part goes back to the bin, if the robot's program does what `ur_cell.script` does.
         Raise CellError like `insert`.
         """
         return self._execute_order(Verb.VERIFY) is ResultCode.GOOD
 
     def proceed(self) -> Outcome:
-        """Have the line go on without measuring; return what became known of the part.
+        """Have the line go on without measuring, wait for that; return what became known of the
+        part.
 
         Raise CellError like `insert`.
         """
         return OUTCOMES[self._execute_order(Verb.PROCEED)]
 
     def reject(self) -> None:
-        """Have the part put back to the bin without measuring; raise CellError like `insert`."""
+        """Have the part put back to the bin without measuring, and wait for that.
+
+        Raise CellError like `insert`.
+        """
         self._execute_order(Verb.REJECT)
 
     def _execute_order(self, verb: Verb) -> ResultCode:

@@ -84,7 +84,8 @@ class RtdeRecorder(AbstractContextManager["RtdeRecorder"]):
     Raises
     ------
     CellError
-        If the controller cannot be reached.
+        If the controller cannot be reached or refuses something, for example because another client
+        still writes one of `inputs` after 2 s.
     SettingError
         For a text that is no trigger, for a channel that the controller does not have, and if
         `before` or `samples` is out of range.
@@ -127,12 +128,19 @@ class RtdeRecorder(AbstractContextManager["RtdeRecorder"]):
         self.close()
 
     def arm(self) -> None:
-        """Discard what was received so far, begun or not; record what begins from now on."""
+        """Discard what was received so far, also an insertion that has begun.
+
+        What begins from now on is recorded; a trigger that is on already begins nothing until it
+        was off.
+        """
         self._reset()
         self.stream.clear()
 
     def report(self) -> StreamReport:
-        """Return the counts of all packages since the connection was opened."""
+        """Return the counts of all packages since the recorder was made, reconnections included.
+
+        `incomplete` is 0.
+        """
         return self.stream.report()
 
     def record(self, timeout: float = 60.0) -> InsertionRecord:
@@ -229,7 +237,11 @@ class RtdeRecorder(AbstractContextManager["RtdeRecorder"]):
         return float("nan") if self._start is None else self._start.time - self._before * self._step
 
     def _reset(self) -> None:
-        """Discard the packages and the start of an insertion that has begun; look for the next."""
+        """Discard the recorder's packages and the start of an insertion; look for the next.
+
+        Packages that the stream has buffered stay. A trigger that is on begins nothing until it was
+        off.
+        """
         self._finder = StartFinder(self._step, self.trigger.quiet_s)
         self._rows = []
         self._start = None

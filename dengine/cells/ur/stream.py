@@ -110,8 +110,9 @@ class RtdeClient:
     def rows(self) -> Iterator[Values]:
         """Yield the values of every data package by column, as they arrive, without an end.
 
-        Raise CellError if the connection is lost or silent for `timeout` seconds, or for bytes that
-        are no RTDE or no package with these columns.
+        They are `timestamp` and all elements of each field that has a requested column. Raise
+        CellError if the connection is lost or silent for `timeout` seconds, or for bytes that are
+        no RTDE or no package with these columns.
         """
         for package in self._incoming:
             if package.type is PackageType.DATA:
@@ -148,7 +149,7 @@ class RtdeClient:
         return package.payload
 
     def _send(self, data: bytes) -> None:
-        """Send bytes to the controller; CellError if the connection is lost."""
+        """Send all of these bytes to the controller; raise CellError if the connection is lost."""
         with instead(
             CellError,
             f"Expected {self.where} to take what it is sent, the connection is lost",
@@ -197,7 +198,7 @@ class Row:
 
     @property
     def timestamp(self) -> float:
-        """Return the time of the controller's clock in seconds."""
+        """Time of the package by the controller's clock, in seconds."""
         return self.values["timestamp"]
 
 
@@ -265,7 +266,10 @@ class RtdeStream:
         self._thread.start()
 
     def close(self) -> None:
-        """Close the connection, and wait until the thread has ended."""
+        """Close the connection, and wait until the thread has ended; safe to call again.
+
+        Buffered packages stay, and `rows` yields them before it ends.
+        """
         self._closing.set()
         with self._news:
             client = self._client
@@ -296,7 +300,7 @@ class RtdeStream:
             yield row
 
     def clear(self) -> None:
-        """Discard the buffered packages."""
+        """Discard the packages that are buffered and not taken yet; the counts stay."""
         with self._news:
             self._rows.clear()
 

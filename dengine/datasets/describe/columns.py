@@ -41,13 +41,20 @@ Tables = Sequence[Table]
 
 
 def counts_of(words: Iterable[str]) -> str:
-    """Return how often each of the 12 most frequent words comes, most frequent first."""
+    """Return a text like "ok: 1,200, empty: 3" with how often each word comes.
+
+    It has the 12 most frequent words, most frequent first; "empty" stands for "".
+    """
     return ", ".join(f"{w or 'empty'}: {n:,}" for w, n in Counter(words).most_common(MOST_WORDS))
 
 
 @dataclass
 class Column:
-    """One column in the tables that have it."""
+    """One column in the tables, one for each recording, that have it.
+
+    Its properties are computed when they are first read, and then kept. `form` is the section
+    `[text]`: how numbers are written.
+    """
 
     name: str
     tables: Tables
@@ -89,7 +96,8 @@ class Column:
     def numbers(self) -> list[Floats]:
         """The numbers of each recording whose cells are all numbers, as `[text]` writes them.
 
-        A word of `text.missing` is NaN. Recordings with other cells are left out.
+        There is an array (rows,) for each. A word of `text.missing` is NaN. Recordings with other
+        cells are left out.
         """
         numbers = list[Floats]()
         for table in self.tables:
@@ -132,7 +140,10 @@ class Column:
 
 
 def columns_of(tables: Tables, form: TextForm) -> dict[str, Column]:
-    """Return the columns of the first table by their names, each with the tables that have it."""
+    """Return the columns of the first table by their names, each with the tables that have it.
+
+    Columns that only other tables have are left out. `form` is the section `[text]`.
+    """
     return {
         name: Column(name, [table for table in tables if name in table.columns], form)
         for name in tables[0].columns
@@ -163,8 +174,8 @@ class Proposal:
     def put(self, key: str, value: Any, note: str = "") -> None:
         """Set a key like `time.column`, with a note on it; does nothing if the user stated it.
 
-        A place of the label or the part clears the other places, as `with_values` does. An earlier
-        note stays if there is no new one.
+        A place of the label or the part clears the other places, as `with_values` does, which also
+        tells the errors. An earlier note stays if there is no new one.
         """
         if key not in self.stated:
             self.description = self.description.with_values({key: value})
