@@ -66,6 +66,7 @@ class Fault:
     column: str = ""
 
     def __str__(self) -> str:
+        """Return "SOURCE, line 3, column Fz: MESSAGE", without a line or column that is not set."""
         line = f", line {self.line}" if self.line else ""
         column = f", column {self.column}" if self.column else ""
         return f"{self.source}{line}{column}: {self.message}"
@@ -129,9 +130,11 @@ class Dataset:
     ordered: bool = True
 
     def __len__(self) -> int:
+        """Return the number of traces; recordings that were left out do not count."""
         return len(self.y)
 
     def __repr__(self) -> str:
+        """Return a short text: name, number and shape of the traces, good ones, and faults."""
         shape = " x ".join(map(str, self.X.shape[1:]))
         good = int(self.y.sum())
         return (

@@ -547,7 +547,10 @@ def _as_kind(kind: Any, value: Any, where: str) -> Any:
 
 
 def expect_one_of(names: Iterable[str], name: str, where: str) -> None:
-    """Raise DataError if a name is not one of these; it suggests the nearest, or lists them all."""
+    """Raise DataError if a name is not one of these; else return nothing.
+
+    The message has the most similar of `names`, or lists all if none is similar, and says `where`.
+    """
     nearest = difflib.get_close_matches(str(name), names, 1)
     wanted = repr(nearest[0]) if nearest else f"one of {', '.join(names)}"
     expect_data(name in names, f"{wanted} in {where}", name)
@@ -587,7 +590,10 @@ def flat(prefix: str, value: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _toml_key(name: str) -> str:
-    """Return a key as TOML writes it, in quotes if it needs them."""
+    """Return a key as TOML writes it: in quotes unless it has only letters, digits, `_` and `-`.
+
+    The letters are those of ASCII.
+    """
     return name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else _toml_value(name)
 
 

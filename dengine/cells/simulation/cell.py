@@ -280,7 +280,8 @@ class SimulatedCell:
     def verify(self) -> bool:
         """Check the height of the part; return whether it is good. A bad one goes back to the bin.
 
-        The clock goes on by `verify_s`. Raise DengineError if no part waits.
+        `clock` goes on by `verify_s` seconds. Afterwards no part waits. Raise DengineError if none
+        waits.
         """
         success = self._take_waiting("verify").success
         self.clock += self.parameters.verify_s
@@ -304,7 +305,10 @@ class SimulatedCell:
         return Outcome.STOPPED
 
     def reject(self) -> None:
-        """Send the part back to the bin without a check. Raise DengineError if no part waits."""
+        """Send the part back to the bin without a check; this takes no time.
+
+        Afterwards no part waits. Raise DengineError if none waits.
+        """
         self._take_waiting("reject")
 
     def _take_waiting(self, call: str) -> SimulatedInsertion:

@@ -77,7 +77,10 @@ FAILURES: dict[int, str] = {
 
 
 def encode_message(number: int, code: Verb | ResultCode) -> int:
-    """Return an order or a result as the integer that its register holds."""
+    """Return an order or a result as the integer that its register holds, 10 * number + code.
+
+    `number` is that of the order, and `code` the verb, or the result code.
+    """
     return 10 * number + code
 
 
@@ -113,8 +116,10 @@ class UrCell(AbstractContextManager["UrCell"]):
     Raises
     ------
     CellError
-        If the robot does not answer, its program stops, or it reports a failure. Every method may
-        raise it.
+        If the robot does not answer, its program stops, or it reports a failure. Each of the four
+        methods of a `Cell` may raise it, too.
+    SettingError
+        For settings that `RtdeRecorder` refuses.
     """
 
     def __init__(
@@ -146,6 +151,7 @@ class UrCell(AbstractContextManager["UrCell"]):
         self.recorder.close()
 
     def __exit__(self, *raised: object) -> None:
+        """Close the connection like `close`; an exception of the block passes."""
         self.close()
 
     def report(self) -> StreamReport:

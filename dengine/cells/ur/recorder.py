@@ -125,6 +125,7 @@ class RtdeRecorder(AbstractContextManager["RtdeRecorder"]):
         self.stream.close()
 
     def __exit__(self, *raised: object) -> None:
+        """Close the connection like `close`; an exception of the block passes."""
         self.close()
 
     def arm(self) -> None:

@@ -38,19 +38,22 @@ class RtdeClient:
     host : str
     port : int, default 30004
     columns : sequence of str
-        Values to receive beside `timestamp`, for example `actual_TCP_force[2]`.
+        Values to receive beside `timestamp`, for example `actual_TCP_force[2]`. Of a vector all
+        elements come.
     inputs : sequence of str
         Fields that `send` writes.
     rate_hz : float, default 500
         Packages per second.
     timeout : float, default 2
-        Seconds of silence after which the connection counts as lost.
+        Seconds of silence after which the connection counts as lost, also while it is made.
 
     Raises
     ------
     CellError
         If the controller cannot be reached or refuses something; later, if the connection is lost
         or something else than RTDE is received.
+    HeldError
+        A CellError: another client writes one of `inputs`.
     SettingError
         If the controller has no such column.
     """
@@ -287,8 +290,8 @@ class RtdeStream:
         """Yield the packages of the robot, each removed from the buffer, for this many seconds.
 
         Packages that are buffered already come first. The time runs from the first call of `next`
-        on the iterator. If the stream is closed, the iteration ends when the buffer is empty or the
-        time is over.
+        on the iterator; with 0 s or less nothing comes. If the stream is closed, the iteration ends
+        when the buffer is empty or the time is over.
         """
         end = time.monotonic() + seconds
         while (left := end - time.monotonic()) > 0:

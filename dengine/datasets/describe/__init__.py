@@ -158,7 +158,10 @@ def likely_endings(names: Names) -> Names:
 
 
 def suffix_of(name: str) -> str:
-    """Return the suffix of a file, in small letters and without `.gz` behind it."""
+    """Return the suffix of a file with its dot, in small letters; "" if there is none.
+
+    Of `x.csv.gz` it is `.csv`.
+    """
     return Path(name.lower().removesuffix(".gz")).suffix
 
 

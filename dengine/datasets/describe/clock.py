@@ -154,7 +154,7 @@ def _unit_by_size(column: Column, p: Proposal) -> str:
 
 
 def is_rate(step: float) -> bool:
-    """Return whether a step in seconds is of a rate that forces are recorded at, 1 Hz to 1 MHz."""
+    """Return whether a step in seconds is of a rate of 1 Hz to 1 MHz, both included."""
     return 1 / MOST_RATE_HZ <= step <= 1 / LEAST_RATE_HZ
 
 

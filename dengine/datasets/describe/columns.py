@@ -62,22 +62,29 @@ class Column:
 
     @cached_property
     def words(self) -> list[NDArray[Any]]:
-        """The words of each recording, an array each; UnreadableError if its cells are lists."""
+        """The words of each recording, an array of texts each, as `Table.words` gives them.
+
+        Raises UnreadableError if cells are lists, and so does every property that needs them.
+        """
         return [table.words(self.name) for table in self.tables]
 
     @cached_property
     def counts(self) -> Counter[str]:
-        """How often each word comes."""
+        """How often each word comes, in all recordings together; an empty cell is the word ""."""
         return Counter(np.concatenate(self.words).tolist())
 
     @cached_property
     def odd(self) -> Counter[str]:
-        """How often each word comes that is not a number with any decimal mark."""
+        """How often each word comes that is no number with any decimal mark; "" is such a word."""
         return Counter({w: n for w, n in self.counts.items() if not NUMBER.fullmatch(w)})
 
     @cached_property
     def strange(self) -> Counter[str]:
-        """How often each word comes that is no number, and neither in `LOST` nor `text.missing`."""
+        """How often each word comes that is no number and does not mean a lost sample.
+
+        These are the `odd` words that are neither in `LOST`, in any case of letters, nor in
+        `text.missing`.
+        """
         return Counter(
             {
                 word: n
@@ -107,12 +114,19 @@ class Column:
 
     @cached_property
     def steps(self) -> Floats:
-        """The differences of successive `numbers` in each recording, one after the other."""
+        """The differences of successive `numbers` in each recording, float64 of shape (n,).
+
+        Those of the recordings stand one after the other; between recordings there is none.
+        """
         return np.concatenate([np.empty(0), *map(np.diff, self.numbers)])
 
     @cached_property
     def unit(self) -> str:
-        """The unit that most files state for the column, or else the one in its name, or ""."""
+        """The unit that most files state for the column, or else the one in its name, or "".
+
+        It has no brackets. A `.2` (of a name that repeats) or `*` at the end of the name is
+        ignored.
+        """
         unit = mode(bare(table.units.get(self.name, "")) for table in self.tables)
         return unit or unit_in(re.sub(r"\.\d+$|\*$", "", self.name))
 

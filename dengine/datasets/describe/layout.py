@@ -110,7 +110,7 @@ def numbered_columns(table: Table) -> list[str]:
 
 
 def has_lists(table: Table) -> bool:
-    """Return whether the first cell of any column is a list of several items."""
+    """Return whether the first cell of any column is a list or array of two items or more."""
     cells = [column[0] for column in table.columns.values() if len(column)]
     return any(isinstance(cell, list | np.ndarray) and len(cell) > 1 for cell in cells)
 
