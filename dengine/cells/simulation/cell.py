@@ -179,7 +179,8 @@ def _find_cause(conditions: Conditions, pushed: Push) -> str:
     a wrong part was drawn, that is the cause. Debris that was drawn is the cause only if the part
     stopped below the rim and at most `SLIP_MM` above the debris. Otherwise the cause is "slip" if
     the part moved more than `SLIP_MM` in the gripper, and else where it stopped: "rim_contact" on
-    the rim of the hole, "stuck" at most `STUCK_MM` above its seat, "wedging" in between.
+    the rim of the hole or its chamfer, "stuck" at most `STUCK_MM` above its seat, "wedging" in
+    between.
     """
     tip_mm = pushed.height_mm - conditions.extra_length_mm  # of the part's tip above the seat
     if conditions.fault in ("missed_grasp", "wrong_part"):

@@ -46,8 +46,8 @@ def spec_of_recording(
 ) -> TraceSpec:
     """Return the `TraceSpec` of the traces that an `RtdeRecorder` with these settings records.
 
-    The unit of a force is N, any other unit, also that of a torque, is unknown. Raises SettingError
-    for values that no trace can have.
+    The unit of a force is N; any other unit, also that of a torque, is unknown. The `columns` are
+    the names of the channels. Raises SettingError for values that no trace can have.
     """
     forces = {f"actual_TCP_force[{i}]" for i in range(3)}
     unit = tuple("N" if CHANNELS.get(name, name) in forces else "" for name in channels)

@@ -251,7 +251,8 @@ class RtdeStream:
     Attributes
     ----------
     trouble : str
-        Why there is no connection at present; "" if there is one.
+        Why there is no connection at present; "" if there is one. But if the first connection took
+        several attempts, the reason stays until the first reconnection.
     """
 
     def __init__(self, connect: Callable[[], RtdeClient], rate_hz: float) -> None:
