@@ -16,6 +16,8 @@ class ReplayCell:
     """Plays labelled traces one by one; the expensive verification returns the recorded label.
 
     An accepted bad part always stops the line. `insert` raises IndexError after the last trace.
+    Nothing checks that the other methods follow an `insert`. Making one raises the errors of
+    `load_dataset`.
 
     Parameters
     ----------
@@ -45,18 +47,25 @@ class ReplayCell:
 
     @property
     def truth(self) -> bool:
-        """Whether the newest part (before any `insert`: the last part) is good, by its label."""
+        """Whether the newest part is good, by its label.
+
+        Before any `insert` it is that of the last part of the order.
+        """
         return bool(self.data.y[self.order[self.position]])
 
     @property
     def part(self) -> str | None:
-        """Number of the newest part; None if the data set has no part numbers."""
+        """Number of the newest part (before any `insert`: of the last part of the order).
+
+        None if the data set has no part numbers.
+        """
         return None if self.data.part is None else str(self.data.part[self.order[self.position]])
 
     def insert(self) -> NDArray[np.floating]:
         """Go on to the next trace and return it, (T,) or (channels, T) as in the data set.
 
-        Raise IndexError after the last one.
+        It is float32, and no copy: it shares its memory with the data set. Raise IndexError after
+        the last one; the newest part then stays the last one.
         """
         if self.position + 1 >= len(self.order):
             raise IndexError(f"The recording has {len(self.order)} cycles, and all were played.")
@@ -64,11 +73,14 @@ class ReplayCell:
         return np.asarray(self.data.X[self.order[self.position]])
 
     def verify(self) -> bool:
-        """Return the recorded label."""
+        """Return whether the newest part is good, by its recorded label; nothing changes."""
         return self.truth
 
     def proceed(self) -> Outcome:
-        """Return STOPPED for a bad part; for a good one CONFIRMED or, by default, UNKNOWN."""
+        """Return STOPPED if the newest part is bad; nothing changes.
+
+        For a good one return CONFIRMED if the cell was made with `confirm`, and else UNKNOWN.
+        """
         if not self.truth:
             return Outcome.STOPPED
         return Outcome.CONFIRMED if self.confirm else Outcome.UNKNOWN

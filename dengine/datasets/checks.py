@@ -88,10 +88,11 @@ def check_text(text: TextForm) -> None:
 def without_repeats(recordings: Sequence[Recording]) -> tuple[list[Recording], list[Fault]]:
     """Return the recordings without repeated traces, and a fault for each recording left out.
 
-    All traces must have the same shape (C, T). Two traces are equal if they have the same
-    `content_hash`, which rounds samples down to 1/65,536 of their unit, and counts lost samples as
-    0. Of equal traces with one label the first is kept; if their labels differ, none is kept. A
-    trace whose finite samples are all the same is always kept: a dead sensor gives it for any part.
+    The recordings kept stay in their order. All traces must have the same shape (C, T). Two traces
+    are equal if they have the same `content_hash`, which rounds samples down to 1/65,536 of their
+    unit, and counts lost samples as 0. Of equal traces with one label the first is kept; if their
+    labels differ, none is kept. A trace whose finite samples are all the same is always kept: a
+    dead sensor gives it for any part.
     """
     traces = [recording.trace for recording in recordings]
     hashes = content_hash(np.stack(traces)).tolist() if traces else []

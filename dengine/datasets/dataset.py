@@ -29,7 +29,10 @@ expect_data = partial(expect, error=DataError)
 
 
 def unit_text(units: Sequence[str]) -> str:
-    """Return the units of channels as a text: "kN, mm", or a single "N" if all are equal."""
+    """Return the units of channels as a text: "kN, mm", or a single "N" if all are equal.
+
+    It is "" if there are no units.
+    """
     return ", ".join(units if len({*units}) > 1 else units[:1])
 
 
@@ -63,6 +66,7 @@ class Fault:
     column: str = ""
 
     def __str__(self) -> str:
+        """Return "SOURCE, line 3, column Fz: MESSAGE", without a line or column that is not set."""
         line = f", line {self.line}" if self.line else ""
         column = f", column {self.column}" if self.column else ""
         return f"{self.source}{line}{column}: {self.message}"
@@ -126,9 +130,11 @@ class Dataset:
     ordered: bool = True
 
     def __len__(self) -> int:
+        """Return the number of traces; recordings that were left out do not count."""
         return len(self.y)
 
     def __repr__(self) -> str:
+        """Return a short text: name, number and shape of the traces, good ones, and faults."""
         shape = " x ".join(map(str, self.X.shape[1:]))
         good = int(self.y.sum())
         return (
@@ -138,14 +144,16 @@ class Dataset:
 
     @property
     def cube(self) -> TraceArray:
-        """The traces, shape (n, C, T) also for a single channel."""
+        """The traces, float32 of shape (n, C, T) also for a single channel; not a copy of `X`."""
         return self.X if self.X.ndim == 3 else self.X[:, None]
 
     @property
     def spec(self) -> TraceSpec:
         """The `TraceSpec` of live traces of the same shape, for `DataEngine(trace=data.spec)`.
 
-        A rate or a unit that is unknown is None.
+        A rate or a unit that is unknown is None; its `columns` are the names of the channels.
+        Raises SettingError if the fields of the data set are none that traces can have, like two
+        equal names of channels.
         """
         _, channels, samples = self.cube.shape
         return TraceSpec(
@@ -157,10 +165,10 @@ class Dataset:
 
         Its columns are `label`, `part` and `cause` if known, and one for each sample of each
         channel: `FZ_0`, `FZ_1`, ... Without channel names they are `x_0`, `x_1`, ... or, if there
-        are several channels, `x0_0`, `x0_1`, ... Its metadata (`attrs`) has the fields `channels`,
-        `rate_hz`, `unit`, `limit` and `fit`, so that `load_dataset` reads what
-        `data.to_frame().to_parquet("data.parquet")` writes, without a description. All other fields
-        are lost.
+        are several channels, `x0_0`, `x0_1`, ... Its metadata (`attrs`, under "dengine") has the
+        fields `channels`, `rate_hz`, `unit`, `limit` and `fit` and the number of channels, so that
+        `load_dataset` reads what `data.to_frame().to_parquet("data.parquet")` writes, without a
+        description. All other fields are lost.
         """
         import pandas as pd
 
@@ -197,9 +205,10 @@ class Dataset:
         """Return a data set with only the first `samples` samples of each trace.
 
         If `fit` is "pad" and the traces become shorter, it becomes "cut" in the result; all other
-        fields stay, `lengths` too. Raises DataError if `samples` is below 1, if the traces are
-        shorter, or if `fit` is "resample" and they would become shorter: their first samples are
-        not those of the recordings.
+        fields stay, `lengths` too. Its X may share its memory with that of this data set if nothing
+        is cut off; otherwise it is a copy. Raises DataError if `samples` is below 1, if the traces
+        are shorter, or if `fit` is "resample" and they would become shorter: their first samples
+        are not those of the recordings.
         """
         most = self.X.shape[-1]
         least = most if self.fit == "resample" else 1
@@ -240,8 +249,8 @@ def make_dataset(
     Returns
     -------
     Dataset
-        Its X has the shape (n, T) if there is one channel, and may share its memory with the given
-        X.
+        Its X is float32, of shape (n, T) if there is one channel, and may share its memory with the
+        given X. Its y is int8, and its `part` are texts.
 
     Raises
     ------

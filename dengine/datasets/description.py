@@ -310,10 +310,12 @@ class Description:
     def from_dict(cls, values: Stated, where: str = "description") -> "Description":
         """Return the description that nested dicts state, like those of a TOML file.
 
-        The value of every key but `version` may be `?`, but no section; a channel named `?` is left
-        out. Of a channel, a text in place of a dict is its unit. `notes` are no key. Raises
-        DataError for an unknown key (the message names the most similar key, or else all), for a
-        value of the wrong type, and for a description of a newer version or one that is no integer.
+        Keys that are left out get their default values. Any key but `version` may have the value
+        `?`, but a section may not. A channel named `?` is left out, and so is this name in `[rows]`
+        and `[ignored]`. Of a channel, a text in place of a dict is its unit. `notes` are no key;
+        the result has none. Raises DataError for an unknown key (the message names the most similar
+        key, or else all), for a value of the wrong type, and for a description of a newer version
+        or one that is no integer.
 
         where : what the description is called in errors.
         """
@@ -403,12 +405,12 @@ class Description:
 
     @property
     def labels(self) -> tuple[LabelSource, ...]:
-        """The source of labels, and those that must agree with it."""
+        """The source of labels, `[label]`, and then those that must agree with it, `[[check]]`."""
         return (self.label, *self.check)
 
     @property
     def is_cut(self) -> bool:
-        """Whether long recordings are cut into parts, as `[windows]` says."""
+        """Whether long recordings are cut into parts, by the trigger or listing of `[windows]`."""
         return bool(self.windows.trigger or self.windows.listing)
 
     @property
@@ -545,7 +547,10 @@ def _as_kind(kind: Any, value: Any, where: str) -> Any:
 
 
 def expect_one_of(names: Iterable[str], name: str, where: str) -> None:
-    """Raise DataError if a name is not one of these; it suggests the nearest, or lists them all."""
+    """Raise DataError if a name is not one of these; else return nothing.
+
+    The message has the most similar of `names`, or lists all if none is similar, and says `where`.
+    """
     nearest = difflib.get_close_matches(str(name), names, 1)
     wanted = repr(nearest[0]) if nearest else f"one of {', '.join(names)}"
     expect_data(name in names, f"{wanted} in {where}", name)
@@ -585,7 +590,10 @@ def flat(prefix: str, value: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _toml_key(name: str) -> str:
-    """Return a key as TOML writes it, in quotes if it needs them."""
+    """Return a key as TOML writes it: in quotes unless it has only letters, digits, `_` and `-`.
+
+    The letters are those of ASCII.
+    """
     return name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else _toml_value(name)
 
 

@@ -77,7 +77,8 @@ def check_agreement(data: Dataset, trace_spec: TraceSpec) -> None:
     If both rates are known, they must be the same within 2 % of the higher one; if both have
     channel names, these must be the same in the same order. Traces that were read by a description
     (`data.lengths` is set) must have the store's number of samples, and the store and the data set
-    must both have the `fit` "resample", or neither. The number of channels is not compared.
+    must both have the `fit` "resample", or neither. The number of channels, the units and the limit
+    are not compared.
     """
     spec = data.spec
     is_resampled = {item.fit == "resample" for item in (spec, trace_spec)}

@@ -94,7 +94,11 @@ def load_dataset(
 
 
 def saved_description(source: FilePath) -> Path:
-    """Return the path at which the description of a folder or a file is saved."""
+    """Return the path at which the description of a folder or a file is saved.
+
+    It is `recordings.toml` in the folder, or `FILE.toml` beside the file, also for a source that
+    does not exist. There need not be a file at it.
+    """
     path = Path(source)
     return path / FOLDER_FILE if path.is_dir() else path.with_name(f"{path.name}.toml")
 
@@ -102,12 +106,14 @@ def saved_description(source: FilePath) -> Path:
 def description_of(
     source: Any, description: Any = None, stated: Stated | None = None, propose: bool = False
 ) -> Description:
-    """Return a description of recordings.
+    """Return a description of recordings: the given one, the saved one, or a proposal.
+
+    Nothing is checked but keys and types (see `check_description`), and nothing is saved.
 
     Parameters
     ----------
     source : path or DataFrame
-        The recordings.
+        The recordings. They are looked at only if `description` is None.
     description : Description, mapping or path, optional
         None: the description that was saved in the folder or beside the file.
     stated : mapping, optional
@@ -174,12 +180,13 @@ def missing_text(path: Path, proposal: Description) -> str:
 def own_reader(source: Any) -> Callable[[], Dataset] | None:
     """Return a function that reads a source in a format of dengine; None if it needs a description.
 
-    The formats: a `Dataset`, a pair (X, y), the name of a bundled set, a table of
-    `Dataset.to_frame` or its Parquet file, an .npz file with X and y, and the SQLite file of a
-    store. A folder needs a description, and so does a file beside which one was saved, whatever it
-    holds. Raises DataError for a source of an unknown type, for a path that does not exist, for a
-    file that cannot be opened, for a damaged .npz or Parquet file, and for a Parquet file without
-    pyarrow.
+    The formats: a `Dataset`, which the function returns itself, a tuple (X, y), the name of a
+    bundled set, a table of `Dataset.to_frame` or its Parquet file, an .npz file with X and labels y
+    of 1 and 0, and a SQLite file, which must be a store. The function takes no arguments and raises
+    the errors of `load_dataset`. A folder needs a description, and so does a file beside which one
+    was saved, whatever it holds. Raises DataError for a source of an unknown type, for a path that
+    does not exist, for a file that cannot be opened, for a damaged .npz or Parquet file, and for a
+    Parquet file without pyarrow.
     """
     if isinstance(source, Dataset):
         return lambda: source

@@ -16,9 +16,11 @@ BROKEN = 44  # the file that is cut off in its last line; the last, if there are
 def write_sample(folder: FilePath, n: int = 200) -> None:
     """Write n insertions of the bundled set as CSV files, such as `insertion_0001_True.csv`.
 
-    Each file has 960 to 1000 rows at 500 Hz, with the time in Timestamp, the force in FZ_Base, the
-    height in TCP_Z, which is only noise, and the label in its name: True is good. File 44, or the
-    last one of fewer, lacks its last 16 characters. The same call always writes the same files.
+    The insertions are drawn at random, none twice; the same call always writes the same files. Each
+    file has 960 to 1000 rows at 500 Hz, with the time in Timestamp, the force in FZ_Base, the
+    height in TCP_Z, which is only noise, and the label in its name: True is good. Times are in
+    seconds; file 1 begins at 1012, and each file 12 s after the one before. File 44, or the last
+    one of fewer, lacks its last 16 characters.
 
     Parameters
     ----------

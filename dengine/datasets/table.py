@@ -211,7 +211,8 @@ def pattern_of(decimal: str, thousands: str) -> re.Pattern[str]:
     """Return the regular expression of a number; a sign and an exponent are allowed.
 
     `decimal` is its decimal mark, and `thousands` the mark that may stand between groups of three
-    digits; "" allows no groups.
+    digits; "" allows no groups. The digits before or behind the decimal mark may be missing, but
+    not both. The pattern is for `fullmatch`, and has no blanks around the number. It is cached.
     """
     mark = re.escape(thousands)
     point = re.escape(decimal)

@@ -46,14 +46,17 @@ class Trigger:
 
     @property
     def signals(self) -> tuple[str, ...]:
-        """Names of the signals that are read: three for a vector, else one."""
+        """Names of the signals that are read: `signal`, or `signal[0]` to `[2]` for motion."""
         vector = (f"{self.signal}[0]", f"{self.signal}[1]", f"{self.signal}[2]")
         return vector if self.kind == "motion" else (self.signal,)
 
     def active(self, signals: Mapping[str, Floats]) -> NDArray[np.bool_]:
         """Return whether the condition is met at each sample, (n,) bool; False if a signal is NaN.
 
-        signals : arrays of shape (n,) by the names of the signals.
+        `quiet_s` does not count here.
+
+        signals : arrays of shape (n,) by the names of the signals; others than `self.signals` are
+        not read.
         """
         values = np.stack([signals[name] for name in self.signals])
         active = KINDS[self.kind][2](np.nan_to_num(values), self.number)

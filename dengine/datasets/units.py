@@ -17,20 +17,24 @@ MARKS = "[](){} "
 
 
 def bare(unit: str) -> str:
-    """Return a unit without brackets around it."""
+    """Return a unit without the brackets `[] () {}` and blanks around it."""
     return unit.strip(MARKS)
 
 
 def quantity_of(unit: str) -> tuple[str, float] | None:
-    """Return the quantity of a unit, and the factor to its first unit; None for an unknown one.
+    """Return the quantity of a unit, like "force", and the factor to its first unit, like N.
 
-    A unit in brackets is unknown, see `bare`.
+    None for an unknown unit, for one that is converted to no other, like `%` or `Hz`, and for a
+    unit in brackets (see `bare`). Capital and small letters differ.
     """
     return UNITS.get(unit)
 
 
 def is_unit(text: str) -> bool:
-    """Return whether a text is a unit of this table, with or without brackets."""
+    """Return whether a text is a unit of this table, with or without brackets.
+
+    Units that are converted to no other, like `%`, count. Capital and small letters differ.
+    """
     return bare(text) in OTHERS or bare(text) in UNITS
 
 
@@ -52,8 +56,9 @@ def conversion(unit: str, wanted: str) -> float | None:
 def unit_in(name: str) -> str:
     """Return the unit at the end of a column's name, as in `Kraft [N]` or `F_kN`; "" if none.
 
-    It must be a unit of this table, in brackets, or behind `in`, `/` or `_`. Behind `/` or `_` a
-    single letter or digit is none, except N: `Fz_W` is a force in world axes.
+    It must be a unit of this table, in brackets, or behind `in`, `/` or `_`, and is returned
+    without them. Behind `/` or `_` a single character is none, except N: `Fz_W` is a force in world
+    axes.
     """
     match = re.search(r"(?:[\[({<]|\bin |[/_](?![^N]$))\s*([^\[\](){}<>/_ ]+)\s*[\])}>]?$", name)
     return match[1] if match and is_unit(match[1]) else ""

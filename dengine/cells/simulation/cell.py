@@ -179,7 +179,8 @@ def _find_cause(conditions: Conditions, pushed: Push) -> str:
     a wrong part was drawn, that is the cause. Debris that was drawn is the cause only if the part
     stopped below the rim and at most `SLIP_MM` above the debris. Otherwise the cause is "slip" if
     the part moved more than `SLIP_MM` in the gripper, and else where it stopped: "rim_contact" on
-    the rim of the hole, "stuck" at most `STUCK_MM` above its seat, "wedging" in between.
+    the rim of the hole or its chamfer, "stuck" at most `STUCK_MM` above its seat, "wedging" in
+    between.
     """
     tip_mm = pushed.height_mm - conditions.extra_length_mm  # of the part's tip above the seat
     if conditions.fault in ("missed_grasp", "wrong_part"):
@@ -280,7 +281,8 @@ class SimulatedCell:
     def verify(self) -> bool:
         """Check the height of the part; return whether it is good. A bad one goes back to the bin.
 
-        The clock goes on by `verify_s`. Raise DengineError if no part waits.
+        `clock` goes on by `verify_s` seconds. Afterwards no part waits. Raise DengineError if none
+        waits.
         """
         success = self._take_waiting("verify").success
         self.clock += self.parameters.verify_s
@@ -304,7 +306,10 @@ class SimulatedCell:
         return Outcome.STOPPED
 
     def reject(self) -> None:
-        """Send the part back to the bin without a check. Raise DengineError if no part waits."""
+        """Send the part back to the bin without a check; this takes no time.
+
+        Afterwards no part waits. Raise DengineError if none waits.
+        """
         self._take_waiting("reject")
 
     def _take_waiting(self, call: str) -> SimulatedInsertion:

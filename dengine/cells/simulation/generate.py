@@ -38,7 +38,8 @@ def simulate(
     scenario : str, default "nominal"
         A name in `SCENARIOS`.
     n_jobs : int, default -1
-        Number of processes; -1: one for each core. `joblib.parallel_config` chooses the backend.
+        Number of processes; -1: one for each core. It changes no result. `joblib.parallel_config`
+        chooses the backend.
     progress : callable, optional
         Called with 1 after each insertion, in the order of the cycles.
     time_step_s : float

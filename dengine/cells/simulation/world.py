@@ -42,7 +42,7 @@ class Push:
     height_mm : float
         Height of the part's top above its nominal seated height; without a part -40.
     slip_mm : float
-        How far the part slid up in the gripper.
+        How far the part slid up in the gripper; without a part 0.
     """
 
     force: Floats

@@ -77,7 +77,10 @@ FAILURES: dict[int, str] = {
 
 
 def encode_message(number: int, code: Verb | ResultCode) -> int:
-    """Return an order or a result as the integer that its register holds."""
+    """Return an order or a result as the integer that its register holds, 10 * number + code.
+
+    `number` is that of the order, and `code` the verb, or the result code.
+    """
     return 10 * number + code
 
 
@@ -113,8 +116,10 @@ class UrCell(AbstractContextManager["UrCell"]):
     Raises
     ------
     CellError
-        If the robot does not answer, its program stops, or it reports a failure. Every method may
-        raise it.
+        If the robot does not answer, its program stops, or it reports a failure. Each of the four
+        methods of a `Cell` may raise it, too.
+    SettingError
+        For settings that `RtdeRecorder` refuses.
     """
 
     def __init__(
@@ -145,6 +150,7 @@ class UrCell(AbstractContextManager["UrCell"]):
         self.recorder.close()
 
     def __exit__(self, *raised: object) -> None:
+        """Close the connection like `close`; an exception of the block passes."""
         self.close()
 
     def report(self) -> StreamReport:
@@ -167,33 +173,38 @@ class UrCell(AbstractContextManager["UrCell"]):
         return self.last.trace
 
     def verify(self) -> bool:
-        """Have the part measured; return whether it is good. A bad part goes back to the bin.
+        """Have the part measured, wait for that, and return whether it is good.
 
+        A bad part goes back to the bin, if the robot's program does what `ur_cell.script` does.
         Raise CellError like `insert`.
         """
         return self._execute_order(Verb.VERIFY) is ResultCode.GOOD
 
     def proceed(self) -> Outcome:
-        """Have the line go on without measuring; return what became known of the part.
+        """Have the line go on without measuring, wait for that; return what became known of the
+        part.
 
         Raise CellError like `insert`.
         """
         return OUTCOMES[self._execute_order(Verb.PROCEED)]
 
     def reject(self) -> None:
-        """Have the part put back to the bin without measuring; raise CellError like `insert`."""
+        """Have the part put back to the bin without measuring, and wait for that.
+
+        Raise CellError like `insert`.
+        """
         self._execute_order(Verb.REJECT)
 
     def _execute_order(self, verb: Verb) -> ResultCode:
         """Send an order (`verb`) to the robot, wait for its result, and return the result.
 
-        It waits at most `order_timeout` seconds. Packages that were received before are discarded.
-        If the connection is lost meanwhile, the order is written again at the first package of the
-        next one, unless the order is 10 s old by then or the controller was restarted: a robot must
-        not move when nobody expects it. The order INSERT also waits, within the same time, for the
-        end of a trace that has begun. It sets `last` to the insertion, or to None if none was
-        complete by then. Raise CellError if the robot does not answer in time, fails, or its
-        program stops.
+        The order gets the next number; after 200,000,000 comes 1. This call waits at most
+        `order_timeout` seconds. Packages that were received before are discarded. If the connection
+        is lost meanwhile, the order is written again at the first package of the next one, unless
+        the order is 10 s old by then or the controller was restarted: a robot must not move when
+        nobody expects it. The order INSERT also waits, within the same time, for the end of a trace
+        that has begun. It sets `last` to the insertion, or to None if none was complete by then.
+        Raise CellError if the robot does not answer in time, fails, or its program stops.
         """
         newest = self.recorder.arm()  # discards what was received between orders
         self._number = self._number % MAX_NUMBER + 1

@@ -67,7 +67,7 @@ class Package(NamedTuple):
     payload: bytes
 
     def to_bytes(self) -> bytes:
-        """Return the package with its header, as it is sent.
+        """Return the package with its header of 3 bytes (size and type), as it is sent.
 
         Raise struct.error for a payload of more than 65,532 bytes.
         """
@@ -75,7 +75,10 @@ class Package(NamedTuple):
 
 
 class PackageReader:
-    """Splits a stream of bytes, received in pieces of any size, into packages."""
+    """Splits a stream of bytes, received in pieces of any size, into packages.
+
+    It keeps the bytes of a package that is not complete yet.
+    """
 
     def __init__(self) -> None:
         self._bytes = bytearray()
@@ -103,7 +106,10 @@ class PackageReader:
 
 @dataclass(frozen=True)
 class RtdeRecipe:
-    """The fields of a data package, with the types that the controller assigned to them."""
+    """The fields of a data package, with the types that the controller assigned to them.
+
+    number : of the recipe, from 0 to 255. names : the fields. types : the type of each, in `TYPES`.
+    """
 
     number: int
     names: tuple[str, ...]
@@ -111,7 +117,10 @@ class RtdeRecipe:
 
     @cached_property
     def layout(self) -> struct.Struct:
-        """Binary layout of a data package: the recipe's number, then the values."""
+        """Binary layout of a data package's payload: the recipe's number, then the values; cached.
+
+        The numbers are big-endian.
+        """
         return struct.Struct(">B" + "".join(TYPES[field_type] for field_type in self.types))
 
     @cached_property

@@ -46,8 +46,8 @@ def spec_of_recording(
 ) -> TraceSpec:
     """Return the `TraceSpec` of the traces that an `RtdeRecorder` with these settings records.
 
-    The unit of a force is N, any other unit, also that of a torque, is unknown. Raises SettingError
-    for values that no trace can have.
+    The unit of a force is N; any other unit, also that of a torque, is unknown. The `columns` are
+    the names of the channels. Raises SettingError for values that no trace can have.
     """
     forces = {f"actual_TCP_force[{i}]" for i in range(3)}
     unit = tuple("N" if CHANNELS.get(name, name) in forces else "" for name in channels)
@@ -84,7 +84,8 @@ class RtdeRecorder(AbstractContextManager["RtdeRecorder"]):
     Raises
     ------
     CellError
-        If the controller cannot be reached.
+        If the controller cannot be reached or refuses something, for example because another client
+        still writes one of `inputs` after 2 s.
     SettingError
         For a text that is no trigger, for a channel that the controller does not have, and if
         `before` or `samples` is out of range.
@@ -124,18 +125,23 @@ class RtdeRecorder(AbstractContextManager["RtdeRecorder"]):
         self.stream.close()
 
     def __exit__(self, *raised: object) -> None:
+        """Close the connection like `close`; an exception of the block passes."""
         self.close()
 
     def arm(self) -> Row | None:
-        """Discard what was received so far, begun or not; record what begins from now on.
+        """Discard what was received so far, also an insertion that has begun.
 
-        Returns the newest package so far, None before the first.
+        What begins from now on is recorded; a trigger that is on already begins nothing until it
+        was off. Returns the newest package so far, None before the first.
         """
         self._reset()
         return self.stream.clear()
 
     def report(self) -> StreamReport:
-        """Return the counts of all packages since the connection was opened."""
+        """Return the counts of all packages since the recorder was made, reconnections included.
+
+        `incomplete` is 0.
+        """
         return self.stream.report()
 
     def record(self, timeout: float = 60.0) -> InsertionRecord:
@@ -232,7 +238,11 @@ class RtdeRecorder(AbstractContextManager["RtdeRecorder"]):
         return float("nan") if self._start is None else self._start.time - self._before * self._step
 
     def _reset(self) -> None:
-        """Discard the packages and the start of an insertion that has begun; look for the next."""
+        """Discard the recorder's packages and the start of an insertion; look for the next.
+
+        Packages that the stream has buffered stay. A trigger that is on begins nothing until it was
+        off.
+        """
         self._finder = StartFinder(self._step, self.trigger.quiet_s)
         self._rows = []
         self._start = None

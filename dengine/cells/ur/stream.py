@@ -38,19 +38,22 @@ class RtdeClient:
     host : str
     port : int, default 30004
     columns : sequence of str
-        Values to receive beside `timestamp`, for example `actual_TCP_force[2]`.
+        Values to receive beside `timestamp`, for example `actual_TCP_force[2]`. Of a vector all
+        elements come.
     inputs : sequence of str
         Fields that `send` writes.
     rate_hz : float, default 500
         Packages per second.
     timeout : float, default 2
-        Seconds of silence after which the connection counts as lost.
+        Seconds of silence after which the connection counts as lost, also while it is made.
 
     Raises
     ------
     CellError
         If the controller cannot be reached or refuses something; later, if the connection is lost
         or something else than RTDE is received.
+    HeldError
+        A CellError: another client writes one of `inputs`.
     SettingError
         If the controller has no such column.
     """
@@ -110,8 +113,9 @@ class RtdeClient:
     def rows(self) -> Iterator[Values]:
         """Yield the values of every data package by column, as they arrive, without an end.
 
-        Raise CellError if the connection is lost or silent for `timeout` seconds, or for bytes that
-        are no RTDE or no package with these columns.
+        They are `timestamp` and all elements of each field that has a requested column. Raise
+        CellError if the connection is lost or silent for `timeout` seconds, or for bytes that are
+        no RTDE or no package with these columns.
         """
         for package in self._incoming:
             if package.type is PackageType.DATA:
@@ -148,7 +152,7 @@ class RtdeClient:
         return package.payload
 
     def _send(self, data: bytes) -> None:
-        """Send bytes to the controller; CellError if the connection is lost."""
+        """Send all of these bytes to the controller; raise CellError if the connection is lost."""
         with instead(
             CellError,
             f"Expected {self.where} to take what it is sent, the connection is lost",
@@ -197,7 +201,7 @@ class Row:
 
     @property
     def timestamp(self) -> float:
-        """Return the time of the controller's clock in seconds."""
+        """Time of the package by the controller's clock, in seconds."""
         return self.values["timestamp"]
 
 
@@ -252,7 +256,6 @@ class RtdeStream:
 
     def __init__(self, connect: Callable[[], RtdeClient], rate_hz: float) -> None:
         self.step = 1.0 / rate_hz
-        self.trouble = ""
         self._open = connect
         self._rows = deque[Row](maxlen=int(BUFFER_S * rate_hz))  # not taken yet
         self._news = threading.Condition()
@@ -261,11 +264,15 @@ class RtdeStream:
         self._counts = Counter[str]()
         self._closing = threading.Event()
         self._client = self._connect(time.monotonic() + RELEASE_S)
+        self.trouble = ""  # of the first attempts
         self._thread = threading.Thread(target=self._read_loop, name="rtde", daemon=True)
         self._thread.start()
 
     def close(self) -> None:
-        """Close the connection, and wait until the thread has ended."""
+        """Close the connection, and wait until the thread has ended; safe to call again.
+
+        Buffered packages stay, and `rows` yields them before it ends.
+        """
         self._closing.set()
         with self._news:
             client = self._client
@@ -283,8 +290,8 @@ class RtdeStream:
         """Yield the packages of the robot, each removed from the buffer, for this many seconds.
 
         Packages that are buffered already come first. The time runs from the first call of `next`
-        on the iterator. If the stream is closed, the iteration ends when the buffer is empty or the
-        time is over.
+        on the iterator; with 0 s or less nothing comes. If the stream is closed, the iteration ends
+        when the buffer is empty or the time is over.
         """
         end = time.monotonic() + seconds
         while (left := end - time.monotonic()) > 0:
@@ -296,7 +303,10 @@ class RtdeStream:
             yield row
 
     def clear(self) -> Row | None:
-        """Discard the buffered packages; return the newest so far, None before the first."""
+        """Discard the packages that are buffered and not taken yet; the counts stay.
+
+        Returns the newest package so far, None before the first.
+        """
         with self._news:
             self._rows.clear()
             return self._newest

@@ -158,7 +158,10 @@ def likely_endings(names: Names) -> Names:
 
 
 def suffix_of(name: str) -> str:
-    """Return the suffix of a file, in small letters and without `.gz` behind it."""
+    """Return the suffix of a file with its dot, in small letters; "" if there is none.
+
+    Of `x.csv.gz` it is `.csv`.
+    """
     return Path(name.lower().removesuffix(".gz")).suffix
 
 
@@ -180,7 +183,11 @@ def names_in(root: Path, patterns: Names) -> Names:
 
 
 def globs(names: Names) -> list[str]:
-    """Return patterns that match the files, one for each suffix; for a single file its name."""
+    """Return patterns that match the files, one for each suffix; for a single file its path.
+
+    They are like `*.csv`, or `**/*.csv` if any file is in a subfolder, and sorted. The suffix has
+    `.gz` behind it if the file has, and its capital letters stay.
+    """
     folders = "**/" if any("/" in name for name in names) else ""
     endings = {name.removeprefix(without_suffix(name)) for name in names}
     return sorted(f"{folders}*{end}" for end in endings) if len(names) > 1 else [*names]

@@ -56,8 +56,9 @@ def propose_clock(p: Proposal) -> None:
     like a date or whole seconds that are the same in all rows of a recording; these are not looked
     for beside a clock whose cells tell the day. It is `?`, too, if no column may (`is_clock`), but
     the columns have no names, or one is named `s`, which may be seconds or the stroke. Otherwise,
-    if no column may, it stays empty. Stated columns are kept; only their forms are found. Raises
-    SettingError for a malformed `windows.trigger`.
+    if no column may, it stays empty. Stated columns are kept; only their forms are found. Of a
+    column that is set `time.format` may be `?` (`form_of`). Raises SettingError for a malformed
+    `windows.trigger`.
     """
     clocks = [column for column in p.columns.values() if is_clock(column)]
     if is_stated := "time.column" in p.stated:
@@ -153,7 +154,7 @@ def _unit_by_size(column: Column, p: Proposal) -> str:
 
 
 def is_rate(step: float) -> bool:
-    """Return whether a step in seconds is of a rate that forces are recorded at, 1 Hz to 1 MHz."""
+    """Return whether a step in seconds is of a rate of 1 Hz to 1 MHz, both included."""
     return 1 / MOST_RATE_HZ <= step <= 1 / LEAST_RATE_HZ
 
 

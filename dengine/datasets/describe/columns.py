@@ -41,13 +41,20 @@ Tables = Sequence[Table]
 
 
 def counts_of(words: Iterable[str]) -> str:
-    """Return how often each of the 12 most frequent words comes, most frequent first."""
+    """Return a text like "ok: 1,200, empty: 3" with how often each word comes.
+
+    It has the 12 most frequent words, most frequent first; "empty" stands for "".
+    """
     return ", ".join(f"{w or 'empty'}: {n:,}" for w, n in Counter(words).most_common(MOST_WORDS))
 
 
 @dataclass
 class Column:
-    """One column in the tables that have it."""
+    """One column in the tables, one for each recording, that have it.
+
+    Its properties are computed when they are first read, and then kept. `form` is the section
+    `[text]`: how numbers are written.
+    """
 
     name: str
     tables: Tables
@@ -55,22 +62,29 @@ class Column:
 
     @cached_property
     def words(self) -> list[NDArray[Any]]:
-        """The words of each recording, an array each; UnreadableError if its cells are lists."""
+        """The words of each recording, an array of texts each, as `Table.words` gives them.
+
+        Raises UnreadableError if cells are lists, and so does every property that needs them.
+        """
         return [table.words(self.name) for table in self.tables]
 
     @cached_property
     def counts(self) -> Counter[str]:
-        """How often each word comes."""
+        """How often each word comes, in all recordings together; an empty cell is the word ""."""
         return Counter(np.concatenate(self.words).tolist())
 
     @cached_property
     def odd(self) -> Counter[str]:
-        """How often each word comes that is not a number with any decimal mark."""
+        """How often each word comes that is no number with any decimal mark; "" is such a word."""
         return Counter({w: n for w, n in self.counts.items() if not NUMBER.fullmatch(w)})
 
     @cached_property
     def strange(self) -> Counter[str]:
-        """How often each word comes that is no number, and neither in `LOST` nor `text.missing`."""
+        """How often each word comes that is no number and does not mean a lost sample.
+
+        These are the `odd` words that are neither in `LOST`, in any case of letters, nor in
+        `text.missing`.
+        """
         return Counter(
             {
                 word: n
@@ -89,7 +103,8 @@ class Column:
     def numbers(self) -> list[Floats]:
         """The numbers of each recording whose cells are all numbers, as `[text]` writes them.
 
-        A word of `text.missing` is NaN. Recordings with other cells are left out.
+        There is an array (rows,) for each. A word of `text.missing` is NaN. Recordings with other
+        cells are left out.
         """
         numbers = list[Floats]()
         for table in self.tables:
@@ -99,12 +114,19 @@ class Column:
 
     @cached_property
     def steps(self) -> Floats:
-        """The differences of successive `numbers` in each recording, one after the other."""
+        """The differences of successive `numbers` in each recording, float64 of shape (n,).
+
+        Those of the recordings stand one after the other; between recordings there is none.
+        """
         return np.concatenate([np.empty(0), *map(np.diff, self.numbers)])
 
     @cached_property
     def unit(self) -> str:
-        """The unit that most files state for the column, or else the one in its name, or ""."""
+        """The unit that most files state for the column, or else the one in its name, or "".
+
+        It has no brackets. A `.2` (of a name that repeats) or `*` at the end of the name is
+        ignored.
+        """
         unit = mode(bare(table.units.get(self.name, "")) for table in self.tables)
         return unit or unit_in(re.sub(r"\.\d+$|\*$", "", self.name))
 
@@ -132,7 +154,10 @@ class Column:
 
 
 def columns_of(tables: Tables, form: TextForm) -> dict[str, Column]:
-    """Return the columns of the first table by their names, each with the tables that have it."""
+    """Return the columns of the first table by their names, each with the tables that have it.
+
+    Columns that only other tables have are left out. `form` is the section `[text]`.
+    """
     return {
         name: Column(name, [table for table in tables if name in table.columns], form)
         for name in tables[0].columns
@@ -163,8 +188,8 @@ class Proposal:
     def put(self, key: str, value: Any, note: str = "") -> None:
         """Set a key like `time.column`, with a note on it; does nothing if the user stated it.
 
-        A place of the label or the part clears the other places, as `with_values` does. An earlier
-        note stays if there is no new one.
+        A place of the label or the part clears the other places, as `with_values` does, which also
+        tells the errors. An earlier note stays if there is no new one.
         """
         if key not in self.stated:
             self.description = self.description.with_values({key: value})

@@ -63,7 +63,10 @@ def layout_of(p: Proposal, files: Tables) -> str:
 
 
 def runs_in(column: Column) -> int:
-    """Return how often successive rows of a table begin with another word, first rows included."""
+    """Return the number of runs in all tables; a run is one word in successive rows.
+
+    A table without rows counts as one run.
+    """
     return sum(int((words[1:] != words[:-1]).sum()) + 1 for words in column.words)
 
 
@@ -77,7 +80,7 @@ def has_long_runs(column: Column) -> bool:
 
 
 def words_in(column: Column) -> int:
-    """Return the number of different words in each table, added up."""
+    """Return the number of different words in each table, added up over the tables."""
     return sum(len({*words}) for words in column.words)
 
 
@@ -107,7 +110,7 @@ def numbered_columns(table: Table) -> list[str]:
 
 
 def has_lists(table: Table) -> bool:
-    """Return whether the first cell of any column is a list of several items."""
+    """Return whether the first cell of any column is a list or array of two items or more."""
     cells = [column[0] for column in table.columns.values() if len(column)]
     return any(isinstance(cell, list | np.ndarray) and len(cell) > 1 for cell in cells)
 

@@ -25,9 +25,10 @@ def propose_order(p: Proposal) -> None:
 
     That is so if a file name stands in several folders, once the text of `label.path` is left out;
     if a file name has a date that is written with the day, the month or AM and PM so that names do
-    not sort by it, or the names are not in the order of their dates; or if a column of
-    `p.unused` has one date or time per recording, and these, as `natural_key` sorts texts, are in
-    another order. An `order` that the user stated stays.
+    not sort by it, or the names are not in the order of their dates; or if a column of `p.unused`
+    has one date or time per recording, and these, as `natural_key` sorts texts, are in another
+    order. If several hold, the note is on the last. An `order` that the user stated stays. Raises
+    SettingError for a malformed `windows.trigger`.
     """
     paths = [without_label(p.description.label, without_suffix(name)) for name in p.names]
     names = [path.rpartition("/")[2] for path in paths]

@@ -122,7 +122,7 @@ def _share_of_numbers(lines: Sequence[str], delimiter: str) -> tuple[float, int]
 
 
 def _count_numbers(cells: Sequence[str]) -> int:
-    """Return how many cells are numbers."""
+    """Return how many cells are numbers, with any decimal mark and any mark of thousands."""
     return sum(1 for cell in cells if NUMBER.fullmatch(cell))
 
 

@@ -20,12 +20,18 @@ Times = tuple[Floats, float]  # the seconds of each row since the first, and the
 
 
 def is_dated(unit: str) -> bool:
-    """Return whether the cells of a clock's column are dates or times of day, not numbers."""
+    """Return whether a clock's column has dates or times of day, not numbers.
+
+    `unit` is its format in `[time]`: `iso` or a form with percent signs.
+    """
     return unit == ISO or "%" in unit
 
 
 def has_day(unit: str) -> bool:
-    """Return whether the cells of a clock's column tell the day."""
+    """Return whether the cells of a clock's column tell at least a day, a month or a year.
+
+    `unit` is its format in `[time]`: `iso`, or a form with a sign like `%d` or `%Y`.
+    """
     return unit == ISO or DATES.search(unit) is not None
 
 

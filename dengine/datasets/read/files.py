@@ -52,7 +52,8 @@ def as_source(source: Any) -> Any:
 def match_files(root: Path, patterns: Sequence[str]) -> set[str]:
     """Return the files below a folder that any pattern matches, as paths relative to the folder.
 
-    Raises DataError for a malformed pattern.
+    The paths have `/` between folders. Folders that match are left out. Raises DataError for a
+    malformed pattern.
     """
     with instead(DataError, f"Expected patterns below a folder in files, got {patterns}", *BAD):
         paths = [path for pattern in patterns for path in root.glob(pattern)]

@@ -91,10 +91,10 @@ def columns_of(prefix: str, value: Any) -> Columns:
 def _turned(value: Any) -> Mapping[Any, Any] | None:
     """Return a list of mappings as a list for each key, or a list of lists as one for each channel.
 
-    The shorter axis of a list of lists is the channels, which are numbered from 0. A mapping is
-    returned as it is, and None for any other value, also an empty list. Keys that the first mapping
-    of a list lacks are left out. Raises LookupError, TypeError or ValueError if an item lacks a key
-    of the first, is of another kind or has another length.
+    The shorter axis of a list of lists is the channels (of equal ones the first), which are
+    numbered from 0. A mapping is returned as it is, and None for any other value, also an empty
+    list. Keys that the first mapping of a list lacks are left out. Raises LookupError, TypeError or
+    ValueError if an item lacks a key of the first, is of another kind or has another length.
     """
     if isinstance(value, Mapping):
         return value
@@ -123,8 +123,8 @@ def as_cells(values: Any) -> Cells:
 def read_frame(frame: Any, source: str) -> Table:
     """Return the table of a DataFrame, whose index is a column if it has a name.
 
-    `source` is the table's name in errors. Rows are numbered from 1. Raises ValueError if the index
-    is named like a column.
+    `source` is the table's name in errors. Names of columns become texts; rows are numbered from 1.
+    Raises ValueError if the index is named like a column.
     """
     frame = frame.reset_index(drop=frame.index.name is None)
     columns = {str(name): frame[name].to_numpy() for name in frame.columns}

@@ -32,7 +32,11 @@ def without_label(source: LabelSource, path: str) -> str:
 
 
 def without_suffix(path: str) -> str:
-    """Return a path without the suffix of its file, and without `.gz` behind it."""
+    """Return a path without the suffix of its file, and without `.gz` behind it.
+
+    A suffix is a point, a letter, and up to seven more letters, digits or `_`; so `run_0.5` has
+    none.
+    """
     return SUFFIX.sub("", path)
 
 
@@ -212,9 +216,10 @@ class LabelReader:
 
 
 def as_key(word: str) -> str:
-    """Return a word as a key of a listing: without leading zeros in a number, with / in a path.
+    """Return a word as a key of a listing, so that keys are equal if they mean the same.
 
-    Excel writes a text as `="0012"`. The names of files are compared in small letters.
+    A number loses its leading zeros, a backslash becomes `/`, and a word with a file's suffix is
+    put in small letters. `="0012"`, like Excel writes a text, is the number 0012, and becomes `12`.
     """
     word = word.removeprefix("=").strip('"')
     word = word.lower() if SUFFIX.search(word) else word

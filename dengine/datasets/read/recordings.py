@@ -38,8 +38,12 @@ def recording_of(
 ) -> Recording | None:
     """Return the recording of a part; None if the part was not checked.
 
-    The times and samples of a part that was not checked must be readable, too, but may be of any
-    length. If `[part]` states nothing, a part that `[windows]` cuts has its key as part number.
+    Rows that `[rows]` drops are left out, then rows are sorted by time if `time.sort` is set, and
+    their times are checked (`check_steps`); samples of rows that `[rows]` calls invalid are NaN.
+    The `length` of the recording is the number of rows kept. Each listing's reader notes its key in
+    `used`. The times and samples of a part that was not checked must be readable, too, but may be
+    of any length. If `[part]` states nothing, a part that `[windows]` cuts has its key as part
+    number.
 
     Parameters
     ----------

@@ -43,10 +43,10 @@ def table_of(content: bytes, name: str, description: Description) -> Table:
 def column_kind(description: Description) -> Kind:
     """Return a function from a column's name to its kind: "number", "word", or "" if not needed.
 
-    Words are dates, part numbers, labels, the column of `order` and those in `[rows]`. Numbers are
-    other columns of channels, of times, and of the signals of the trigger. A column that the
-    description does not name so is not needed. Raises SettingError if `windows.trigger` is
-    malformed.
+    Words are dates, part numbers, labels, the column of `order` and those in `[rows]`, also if they
+    are channels, too. Numbers are other columns of channels, of times, and of the signals of the
+    trigger. A column that the description does not name so is not needed. Raises SettingError if
+    `windows.trigger` is malformed.
     """
     clock = description.time
     forms = zip(clock.column, clock.format, strict=False)
@@ -58,6 +58,7 @@ def column_kind(description: Description) -> Kind:
     patterns = [*map(pattern_of, description.channels)]
 
     def kind_of(name: str) -> str:
+        """Return "word", "number" or "" for the column of this name; "word" if both fit."""
         if name in words:
             return WORD
         is_channel = any(pattern.fullmatch(name) for pattern in patterns)
@@ -76,12 +77,15 @@ def signals_of(description: Description) -> Sequence[str]:
 
 
 def verdicts_of(description: Description) -> set[str]:
-    """Return the topics of a bag that hold labels."""
+    """Return the topics of a bag that hold labels, of `[label]` and `[[check]]`; empty without."""
     return {source.topic for source in description.labels} - {""}
 
 
 def pattern_of(column: str, any_text: str = ".*") -> re.Pattern[str]:
-    """Return the pattern of a channel's columns, in which `*` stands for any text."""
+    """Return the pattern of a channel's columns, in which `*` stands for any text.
+
+    `any_text` is the regular expression that replaces each `*`. The pattern is for `fullmatch`.
+    """
     return re.compile(any_text.join(map(re.escape, column.split(ANY))), re.DOTALL)
 
 
@@ -222,7 +226,10 @@ def _split_columns(table: Table, description: Description) -> Iterator[Table]:
 
 
 def without_empty_end(cells: Cells) -> Cells:
-    """Return the cells of a column, shape (n,), without those at the end that are empty or NaN."""
+    """Return the cells of a column, shape (n,), without those at the end that are empty or NaN.
+
+    The texts "NaN" and "nan" count as NaN. All other cells stay, also empty ones between them.
+    """
     n = len(cells)
     while n and as_word(cells[n - 1]) in ("", "NaN", "nan"):
         n -= 1

@@ -104,7 +104,8 @@ def to_utf8(content: bytes, encoding: str) -> bytes:
 def split_line(line: str, delimiter: str) -> list[str]:
     """Return the cells of one line; a blank as delimiter stands for any run of blanks.
 
-    Quotes mean nothing then, nor in a line with a cell that is too long for the `csv` module.
+    Quotes mean nothing then, nor in a line with a cell that is too long for the `csv` module. With
+    another delimiter blanks around a cell stay. An empty line has no cells.
     """
     with suppress(csv.Error):
         return line.split() if delimiter == BLANK else next(csv.reader([line], delimiter=delimiter))
@@ -114,7 +115,7 @@ def split_line(line: str, delimiter: str) -> list[str]:
 def header_names(cells: Sequence[str]) -> list[str]:
     """Return the names of columns in a header; empty cells become `column1`, `column2`, ...
 
-    A name that repeats gets a number, like `X.2`.
+    Blanks around a name are left out. A name that repeats gets a number, like `X.2`.
     """
     names = [cell.strip() or f"column{i}" for i, cell in enumerate(cells, 1)]
     places = [names[: i + 1].count(name) for i, name in enumerate(names)]
