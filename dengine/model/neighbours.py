@@ -204,20 +204,26 @@ def structure_of(eager: nn.Module) -> tuple[Any, ...]:
 def _as_key(value: object) -> object:
     """Return a hashable key of an attribute for `structure_of`; None if it makes no difference.
 
-    It is the text of a constant and the shape of a tensor. A list, tuple or dict gives its type and
-    the sorted names of its items with their keys. A function is its own key: its address would not
-    do, since another function may get it later. Any other value gives None.
+    A list, tuple or dict gives its type and the sorted names and keys of its items. The key of an
+    item is the text of a constant, the shape of a tensor, and else its own `_as_key`. A function is
+    its own key: its address would not do, since another function may get it later. Any other value,
+    and so a constant outside a container, gives None.
     """
     if isinstance(value, FUNCTIONS):
         return value
-    if isinstance(value, CONSTANTS):
-        return repr(value)
-    if isinstance(value, Tensor):
-        return tuple(value.shape)
     if not isinstance(value, list | tuple | dict):
         return None
-    items = value.items() if isinstance(value, dict) else enumerate(value)
-    return (type(value), *sorted((repr(name), _as_key(item)) for name, item in items))
+    keys: list[tuple[str, object]] = []
+    for name, item in value.items() if isinstance(value, dict) else enumerate(value):
+        key: object
+        if isinstance(item, CONSTANTS):
+            key = repr(item)
+        elif isinstance(item, Tensor):
+            key = tuple(item.shape)
+        else:
+            key = _as_key(item)
+        keys.append((repr(name), key))
+    return (type(value), *sorted(keys))
 
 
 def compiled(eager: Decider, warm_up_shape: tuple[int, ...]) -> Any:
@@ -231,7 +237,8 @@ def compiled(eager: Decider, warm_up_shape: tuple[int, ...]) -> Any:
     submodules = dict(module.named_modules(remove_duplicate=False))
     for path, submodule in eager.named_modules(remove_duplicate=False):
         for name, value in attributes_of(submodule).items():
-            if has_tensor(value):
+            is_container = isinstance(value, list | tuple | dict)
+            if isinstance(value, Tensor) or (is_container and has_tensor(value)):
                 setattr(submodules[path], name, value)
     return module
 
