@@ -78,13 +78,20 @@ class RidgeProblem:
         return cls(g32, g32.double(), y.double(), outside.double(), ridge)
 
     def objective(self, w: Tensor) -> Tensor:
-        """Compute the sum of log losses plus the ridge of heads (K, W + 1): (K,)."""
+        """Compute the objective of heads w (K, W + 1), in nats: (K,).
+
+        It is the sum of log losses over the rows that train the head, plus half the ridge times the
+        square of each weight.
+        """
         logits = w @ self.g.T
         losses = summed_loss(logits, self.y, self.mask)
         return losses + 0.5 * (self.ridge * w * w).sum(1)
 
     def gradient(self, w: Tensor, p: Tensor) -> Tensor:
-        """Compute the gradient of the objective at heads that predict p (K, n): (K, W + 1)."""
+        """Compute the gradient of `objective` at heads w (K, W + 1): (K, W + 1).
+
+        `p` (K, n) are the probabilities that these heads give; they are not computed here.
+        """
         return (self.mask * (p - self.y)) @ self.g + self.ridge * w
 
     def cholesky_of_hessian(self, k: int, p: Tensor) -> Tensor:
@@ -262,5 +269,9 @@ def masked_loss(logits: Tensor, y: Tensor, mask: Tensor) -> Tensor:
 
 
 def summed_loss(logits: Tensor, y: Tensor, mask: Tensor) -> Tensor:
-    """Sum log losses over the rows that each mask selects; arguments as in `masked_loss`."""
+    """Sum log losses, in nats, over the rows that each mask selects; 0 for a mask without rows.
+
+    The arguments are those of `masked_loss`: logits (..., K, n), labels y (n,), mask (K, n) of 1
+    and 0. Returns (..., K).
+    """
     return (mask * (F.softplus(logits) - y * logits)).sum(-1)
