@@ -131,7 +131,7 @@ def survey_dataset(data: Dataset) -> Survey:
 
 
 def _spread(lengths: Ints | None) -> Spread | None:
-    """Return the smallest, median and largest length; None without lengths."""
+    """Return the smallest, median and largest length (n,), as floats; None if there are none."""
     if lengths is None or not len(lengths):
         return None
     return Spread(*np.quantile(lengths, (0.0, 0.5, 1.0)).tolist())

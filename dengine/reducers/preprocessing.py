@@ -82,7 +82,8 @@ class Preprocessor(nn.Module):
     def standardise(self, x: Tensor) -> Tensor:
         """Averaged traces x (B, C, L) -> standardised and clipped (B, C, L).
 
-        The values of each channel are (x - mean) * scale, clipped at ±8. Before `learn` the mean is 0 and the scale 1.
+        The values of each channel are (x - mean) * scale, clipped at ±8. Before `learn` the mean is
+        0 and the scale 1.
         """
         return ((x - self.mean) * self.scale).clamp(-self.clip, self.clip)
 

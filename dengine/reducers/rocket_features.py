@@ -65,7 +65,16 @@ class RocketEncoder(nn.Module):
     Attributes
     ----------
     towers : list of slice
-        Columns of each tower among the P features.
+        Columns of each tower among the P features; one slice if `groups` is 0.
+
+    Raises
+    ------
+    SettingError
+        For fewer than 2 samples.
+
+    Notes
+    -----
+    All kernels are 0 until `learn` draws them, or until a state is restored.
     """
 
     shift: Tensor
@@ -167,7 +176,11 @@ class RocketEncoder(nn.Module):
         return torch.cat([ramps, self.competition_features(sparse, batch)], 1)
 
     def scale_features(self, raw: Tensor) -> Tensor:
-        """Standardise raw features (B, P) and clip them at 4 deviations: (B, P)."""
+        """Standardise unscaled features (B, P) and clip them at ±4 deviations: a new tensor (B, P).
+
+        Each becomes `offset` + `gain` times the feature; before `learn_feature_scales` these are 0
+        and 1. `raw` is not changed.
+        """
         scaled = torch.addcmul(self.offset, raw, self.gain)
         return scaled.clamp_(-self.feature_clip, self.feature_clip)
 
@@ -331,8 +344,9 @@ class RocketEncoder(nn.Module):
 def compute_raw_features(encoder: RocketEncoder, traces: Floats) -> Tensor:
     """Compute the unscaled features of traces (n, C, T): float32 (n, P).
 
-    The encoder computes 32 traces at a time. The features of a trace are the same to the bit
-    whatever other traces it comes with, since the last 32 are filled up with traces of zeros.
+    Gradients are not switched off here. The encoder computes 32 traces at a time. The features of a
+    trace are the same to the bit whatever other traces it comes with, since the last 32 are filled
+    up with traces of zeros.
     """
     features = []
     for chunk in torch.split(torch.from_numpy(traces), CHUNK):

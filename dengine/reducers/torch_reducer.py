@@ -90,7 +90,12 @@ class Augmentation:
     mixup: float
 
     def __call__(self, x: Tensor, y: Tensor, rng: np.random.Generator) -> tuple[Tensor, Tensor]:
-        """Augment a batch; a trace is mixed with another trace of the same copy of the network.
+        """Augment a batch: shift, scale, add noise, mix; return new tensors.
+
+        A shifted trace repeats its end frame. A trace is mixed with the one before it in the batch,
+        of the same copy of the network; its own share is at least a half. If `mixup` is 0, nothing
+        is mixed, and `y` itself is returned. Shift, factor and share are drawn for each trace and
+        copy.
 
         Parameters
         ----------
@@ -152,6 +157,7 @@ class TorchReducer(ProbabilityReducer):
         Of AdamW. The rate is constant, since training never ends.
     weight_averaging : float, default 0.97
         Share of the averaged weights that remains in a step; the rest comes from the new weights.
+        In the first steps it is smaller.
     shift, gain, noise, mixup : default 5, 0.05, 0.03, 0.1
         Augmentation: frames of shift in time, standard deviations of a factor and of white noise,
         and the parameter of mixup; 0 turns each off.
@@ -200,12 +206,12 @@ class TorchReducer(ProbabilityReducer):
         """Train on traces (n, C, T), labels y (n,) 1 or 0, and folds (n,); replace `encoder_`.
 
         It takes `n_steps_due` steps, or fewer if `stop` ends them, and starts from the weights of
-        the last training, or from initial weights the first time. `numbers` is not read, and folds
-        are not checked. Augmentation and randomness are those of `fit_loop`. Returns the points of
-        the traces, float32 (n, d), row i in embedding space ``folds[i]``. Raises the errors of
-        `check_traces`, and SettingError for fewer than two traces outside a fold, and at the first
-        training for fewer than 20 traces, or a parameter, network or checkpoint that cannot be
-        used.
+        the last training, or from initial weights the first time. `numbers` is only read by
+        `ConvReducer`, and folds are not checked. Augmentation and randomness are those of
+        `fit_loop`. Returns the points of the traces, float32 (n, d), row i in embedding space
+        ``folds[i]``. Raises the errors of `check_traces`, and SettingError for fewer than two
+        traces outside a fold, and at the first training for fewer than 20 traces, or a parameter,
+        network or checkpoint that cannot be used.
         """
         traces = self._check_and_initialize(X)
         steps = self.n_steps_due(len(traces))
@@ -455,6 +461,7 @@ class TorchReducer(ProbabilityReducer):
         return embed_in_chunks(self.encoder_, torch.from_numpy(self.check_traces(X)), CHUNK)
 
     def warm_up(self) -> None:
+        """Import what AdamW's first step needs, once in a process; see `warm_optimizer`."""
         warm_optimizer()
 
     def module(self) -> nn.Module | None:
@@ -639,7 +646,8 @@ def draw_batches(
 def warm_optimizer() -> None:
     """Take a step on one weight, once in a process.
 
-    The first step of an optimiser imports a compiler, which takes two seconds.
+    The first step of an optimiser imports a compiler, which takes two seconds. Later calls do
+    nothing.
     """
     weight = nn.Parameter(torch.zeros(1))
     weight.grad = torch.zeros(1)
@@ -647,7 +655,7 @@ def warm_optimizer() -> None:
 
 
 def standard_normal(rng: np.random.Generator, *shape: int) -> Tensor:
-    """Draw a float32 tensor of a standard normal distribution."""
+    """Draw a float32 tensor of this shape from the standard normal distribution, by `rng`."""
     return torch.from_numpy(rng.standard_normal(shape, dtype=np.float32))
 
 

@@ -176,12 +176,18 @@ class UmapEncoder(nn.Module):
 
 
 def weighted_mean(points: Tensor, weights: Tensor) -> Tensor:
-    """Return the weighted means (B, dim) of points (B, n, dim), weights (B, n)."""
+    """Return the means (B, dim) of points (B, n, dim), weighted by `weights` (B, n).
+
+    The weights of a row need not sum to 1; NaN if they sum to 0.
+    """
     return (weights.unsqueeze(2) * points).sum(1) / weights.sum(1, keepdim=True)
 
 
 def padded(rows: Tensor, value: float) -> Tensor:
-    """Return rows (n, ...) with rows of `value` appended, to a power of two and at least 256."""
+    """Return rows (n, ...) with rows of `value` appended, in a new tensor.
+
+    The number of all rows is then the least power of two that is at least n and at least 256.
+    """
     n = len(rows)
     slots = max(MIN_SLOTS, 1 << (n - 1).bit_length())
     return torch.cat([rows, torch.full((slots - n, *rows.shape[1:]), value)])
@@ -292,7 +298,7 @@ class UmapReducer(Reducer):
         return as_points(self.embedding_.numpy())
 
     def n_epochs_due(self, n_traces: int) -> int:
-        """Return the number of epochs that the next training takes on `n_traces` traces.
+        """Return the number of epochs that the next `train` takes on `n_traces` traces.
 
         It is `n_epochs` if that was given. Otherwise it is the number of epochs that are missing to
         the first 200; if none is missing, it is 240,000 / n_traces but at least 60. In both cases
@@ -450,11 +456,19 @@ class UmapReducer(Reducer):
         return UmapEncoder(make_frames, references, points, self.n_neighbors, self.min_dist).eval()
 
     def module(self) -> UmapEncoder:
+        """Return the present `encoder_` itself, (B, C, T) -> (B, 1, d).
+
+        Later trainings replace it and do not change it. Raises NotFittedError before a fit.
+        """
         check_is_fitted(self, "encoder_")
         return self.encoder_
 
     @property
     def n_steps_left_(self) -> int:
+        """Return how many epochs the first layout still lacks, or 0.
+
+        That is 200, or `n_epochs` if given, less `n_epochs_`.
+        """
         return max(0, self._n_first_epochs - self.n_epochs_)
 
     @property
