@@ -246,9 +246,9 @@ class Recipe:
 
         Settings that are missing get their defaults, and "none" is read as None, but not in
         [policy], which has no None. The policy's "windows", the name in earlier versions, is read
-        as "force_limits". No class of a reducer is imported, so an unknown reducer is not noticed
-        here. Raises SettingError for text that is not TOML, an unknown key or a value out of range.
-        `where` is the recipe's name in errors.
+        as "force_limits". No class is imported, so an unknown reducer or `module:Class` is not
+        noticed here. Raises SettingError for text that is not TOML, an unknown key or a
+        value out of range. `where` is the recipe's name in errors.
         """
         # tomllib raises ValueError for huge integers, too.
         with instead(SettingError, f"{where} is not TOML", ValueError, RecursionError):

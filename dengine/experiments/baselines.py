@@ -268,6 +268,7 @@ class AgreeingNeighbours(Baseline):
         self.thresholds = (1.0, 0.0)
 
     def _fit(self, X: Traces, good: Labels) -> bool:
+        """Keep all labelled traces (n, C, T); return whether there are at least `k`."""
         self._references = LabelledPoints(_rows(X), good)
         return len(good) >= self.k
 

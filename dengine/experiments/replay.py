@@ -589,14 +589,15 @@ def replay_policy(scores: Replay, policy: Policy) -> Replay:
 
     No model is asked. In shadow mode every part was verified, and the counts and embeddings of the
     model were recorded. The rule of the policy decides on these; a rule that only sorts takes the
-    first axis of the embedding, if the reducer predicts a probability there, and no counts. It
-    learns only outcomes that it would know in a replay of its own: checks, audits and line stops,
-    and with `stops="all"` also that an accepted part was good. Two differences to such a replay
-    stay: the predictions come from a model that has learned all labels, and the force limits are
-    those of `scores`; those of `policy` are not applied, since a replay has no traces. Audits are
-    drawn anew, by the seed of the replay. A part for which the model was not asked, such as a novel
-    one or one that left an operator's force limits, is verified; the rule learns its outcome, too,
-    with the bounds 0 and 1.
+    first axis of the embedding, if the reducer predicts a probability there, and no counts. This
+    probability is drawn towards 1/2 while few parts have come (`fade`), if the rule has
+    `prior_labels`. A rule learns only outcomes that it would know in a replay of its own: checks,
+    audits and line stops, and with `stops="all"` also that an accepted part was good. Two
+    differences to such a replay stay: the predictions come from a model that has learned all
+    labels, and the force limits are those of `scores`; those of `policy` are not applied, since a
+    replay has no traces. Audits are drawn anew, by the seed of the replay. A part for which the
+    model was not asked, such as a novel one or one that left an operator's force limits, is
+    verified; the rule learns its outcome, too, with the bounds 0 and 1.
 
     Parameters
     ----------

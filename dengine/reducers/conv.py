@@ -207,6 +207,7 @@ class ConvReducer(TorchReducer):
             self.rocket_.raw_features(traces, numbers)
 
     def _initialize(self, traces: Floats) -> None:
+        """Do what `TorchReducer._initialize` does, and draw the kernels of a new `rocket_`."""
         super()._initialize(traces)
         self.rocket_._initialize(traces)
 

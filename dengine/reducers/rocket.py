@@ -305,6 +305,10 @@ class RocketReducer(ProbabilityReducer):
     max_iter: int = 20
 
     def _fit(self, traces: Floats, labels: Ints, folds: Ints) -> None:
+        """Fit the heads on checked traces (n, C, T) without a deadline; see `train_heads`.
+
+        Raises SettingError if the traces outside a fold have a single class.
+        """
         check_classes(labels, self.training_masks(folds))
         self.train_heads(traces, labels, folds, StopRule())
 

@@ -282,6 +282,7 @@ class TorchReducer(ProbabilityReducer):
         self.loss_ = float("nan")
 
     def _fit(self, traces: Floats, labels: Ints, folds: Ints) -> None:
+        """Take `fit_steps` steps on checked traces (n, C, T), without a deadline; see `_train`."""
         self._train(traces, labels, folds, StopRule(), self.fit_steps)
 
     def _train(

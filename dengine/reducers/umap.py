@@ -286,10 +286,10 @@ class UmapReducer(Reducer):
         training; labels and folds are not read. The layout goes on from the last one if at least
         half of the traces were in it; otherwise, or without `numbers`, it starts anew; if none of
         them was in the last search of neighbours, or without `numbers`, the seed and the frames are
-        new as well. `stop` may end the epochs; after its deadline at most ten more are taken.
-        Returns the points of the traces, float32 (n, n_components), which share their memory with
-        `embedding_`. Raises the errors of `check_traces`, and SettingError for a parameter out of
-        its range, or too few traces.
+        new as well. `stop` may end the epochs; after its deadline at most ten more are taken. What
+        `precompute` found is used and then dropped. Returns the points of the traces, float32 (n,
+        n_components), which share their memory with `embedding_`. Raises the errors of
+        `check_traces`, and SettingError for a parameter out of its range, or too few traces.
         """
         traces = self._check(X, reset=not self._is_fitted)
         if numbers is None or not self._has_searched_any(numbers):
