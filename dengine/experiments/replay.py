@@ -422,6 +422,7 @@ def to_replay(observed: Sequence[ObservedCycle], recipe: Recipe) -> Replay:
 
     `recipe` is the recipe of the engine that drove the cell. The fields that only a replay of a
     recorded data set has (`index`, `dataset`, `seed`, `confirm`, `seconds`) keep their defaults.
+    `name` is the recipe's name, and `retrains` has the reports that the cycles carry.
     """
     cycles = [cycle for cycle, _ in observed]
     decisions = [cycle.decision for cycle in cycles]

@@ -54,7 +54,8 @@ class Survey:
         Usable traces that equal an earlier one, by `content_hash`.
     near_repeats, looked_at : int
         The first counts, among the newest `looked_at` usable traces, at most 500, those that are
-        much nearer to another part's trace than parts are to each other. It is 0 for fewer than 100 traces.
+        much nearer to another part's trace than parts are to each other. It is 0 for fewer than 100
+        traces.
     parts : int or None
         Different parts; None if their numbers are not known.
     """

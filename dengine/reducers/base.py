@@ -58,8 +58,8 @@ class StopRule:
         Value of `clock` after which no further step begins. None: no deadline, so that a fit
         repeats exactly for a seed.
     max_steps : int, optional
-        Largest number of steps.
-    clock : callable
+        Largest number of steps. None: no limit.
+    clock : callable, default `time.perf_counter`
         Returns the present time in seconds.
     late : bool
         Whether the deadline, and not the number of steps, ended the fit.
@@ -101,7 +101,7 @@ class FitReport:
     n_steps : int
         Optimiser steps that it took.
     note : str
-        One line for the operator.
+        One line for the operator; "" if there is nothing to say.
     n_steps_left : int
         Steps that are missing until training is complete. If there are some, an engine without a
         product retrains again without waiting for new labels.
@@ -117,19 +117,19 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
 
     Attributes
     ----------
-    uses_labels : bool
+    uses_labels : bool, default False
         Whether `fit` reads `y`. A reducer that does, and has a single space, is cross-fitted by
         `as_reducer`.
-    scores : bool
+    scores : bool, default False
         Whether the first coordinate is the predicted probability of success.
-    own_unit : bool
+    own_unit : bool, default False
         Whether the embedding has a unit, a probability for example. It is then not scaled.
-    min_traces : int
+    min_traces : int, default 1
         Number of labelled traces that an engine collects before the first training.
-    default_radius : float
+    default_radius : float, default 0.3
         Radius of the neighbourhood whose labels count, if a recipe names none. Unless `own_unit`
         is True, the embedding is first scaled to a root mean square radius of 1.
-    default_retrain_every : int
+    default_retrain_every : int, default 50
         New labels between two retrains, if a recipe names none.
     why_no_module_ : str or None
         Why `module` returns None, for the error of an export; None if that is not known yet.

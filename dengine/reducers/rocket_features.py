@@ -367,9 +367,10 @@ def rocket_kernels() -> Tensor:
 def tap_positions(frames: int, dilations: int, places: int) -> NDArray[np.int64]:
     """Return the frame that each tap of a kernel reads, int64 (D, 9, P), for P places in a trace.
 
-    A tap is one of the nine inputs of a kernel. The dilations are spaced evenly in their logarithm,
-    from 1 to that at which a kernel spans the trace. `dilations` is the largest D; D is smaller for
-    short traces. For a tap beyond the ends of the trace the position is
+    A tap is one of the nine inputs of a kernel. The places are spaced evenly over the trace, and a
+    kernel reads four inputs on each side of its place, a dilation apart. The dilations are spaced
+    evenly in their logarithm, from 1 to that at which a kernel spans the trace. `dilations` is the
+    largest D; D is smaller for short traces. For a tap beyond the ends of the trace the position is
     ``2 * frames - 1``, at which `RocketEncoder.read_taps` finds a zero.
     """
     widest = np.log2((frames - 1) / (TAPS - 1)) if frames > TAPS else 0.0  # spans the trace
