@@ -235,7 +235,7 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
     def untrained_module(self, X: Floats) -> Any:
         """Return a module like the one that `module` returns after training on X (n, C, T).
 
-        Its attribute `dim` is the number of coordinates; its weights are of no use yet. None, the
+        Its attribute `dim` is the number of coordinates; its weights do not matter. None, the
         default, if the module is not known before training. X is only read. The engine compiles
         this module ahead of the first training, which then has less to do.
         """
@@ -380,6 +380,7 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
 
     @property
     def _n_features_out(self) -> int:  # scikit-learn's name, for get_feature_names_out
+        """Return d, by embedding a trace of zeros; NotFittedError before a fit."""
         check_is_fitted(self)
         return int(self.transform(np.zeros((1, *self.trace_shape_))).shape[1])
 

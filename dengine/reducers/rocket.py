@@ -284,7 +284,7 @@ class RocketReducer(ProbabilityReducer):
     Attributes
     ----------
     n_iter_ : int
-        Steps of the last fit.
+        Newton steps of the last fit, of the tower that took most.
     holdout_losses_ : array of float64, shape (K,)
         Leave-one-out log loss of the logit of each space, over the rows outside its fold.
 

@@ -147,10 +147,11 @@ class TorchReducer(ProbabilityReducer):
         K, the number of folds, and so of copies of the network and of spaces. Copy k is trained
         without the labels of fold k.
     steps : int, default 12
-        AdamW steps of a retrain; twice as many while training is behind (see `n_steps_left_`).
+        AdamW steps of a retrain; up to twice as many while training is behind (see
+        `n_steps_left_`).
     fit_steps : int, default 400
-        Steps of `fit`, and of the training after many labels came at once; twice as many hardly
-        lower the loss.
+        Steps of `fit`, and the steps of all retrains together after which training is complete,
+        however many labels there are; twice as many hardly lower the loss.
     batch_size : int, default 32
         Traces in a step, for each copy of the network.
     learning_rate, weight_decay : float, default 4e-3, 0.02
@@ -573,9 +574,9 @@ class TorchReducer(ProbabilityReducer):
     def check(self) -> None:
         """Raise SettingError for a parameter out of its range.
 
-        folds must be an integer from 2 to 1000, batch_size one of at least 2, steps and fit_steps
-        of at least 1, shift of at least 0, all up to a million. n_components is 1 or 2,
-        learning_rate above 0, weight_averaging below 1, and no other number is negative or
+        Integers are folds from 2 to 1000, batch_size of at least 2, steps and fit_steps of at least
+        1, shift of at least 0 (these four up to a million), and n_components, 1 or 2. learning_rate
+        is above 0, weight_averaging below 1, and no other number is negative or
         infinite. checkpoint is a text or path; no file is looked at.
         """
         check_integers(

@@ -68,7 +68,7 @@ FIRST_EPOCHS = 200  # that a layout needs from a spectral start, in one training
 MIN_EPOCHS = 60  # of a later training
 MAX_EPOCHS = 200
 WORK = 240_000  # traces times epochs of a later training, between these two
-MAX_WORK = 400_000  # traces times epochs of any training, which bounds its time
+MAX_WORK = 400_000  # traces times epochs of any `train`, which bounds its time
 N_ITERATIONS = 5  # that move a new trace to where attraction balances; 20 decide hardly more parts
 SMALLEST_SQUARE = 1e-3  # of a distance between points, at which attraction is infinite
 MIN_SLOTS = 256  # for references in an encoder: many versions share one compiled module
@@ -210,8 +210,9 @@ class UmapReducer(Reducer):
     min_dist : float, default 0.1
         Distance in the embedding up to which neighbours are drawn together.
     n_epochs : int, optional
-        Epochs of every training. By default `fit` takes 200; `train` takes 240,000 / n, from 60
-        to 200, and at most 400,000 / n, which bounds its time.
+        Epochs of every training. By default `fit` takes 200. `train` takes those that are missing
+        to the first 200, and later 240,000 / n but at least 60; in both cases at most 200, and at
+        most 400,000 / n, which bounds its time.
     random_state : int, RandomState or None, default 0
         Seed of the negative samples, and of the noise on the points from which a layout starts.
 
@@ -473,6 +474,7 @@ class UmapReducer(Reducer):
 
     @property
     def _n_first_epochs(self) -> int:
+        """Return the epochs that a first layout needs: `n_epochs`, or 200 if that is None."""
         return FIRST_EPOCHS if self.n_epochs is None else self.n_epochs
 
     @property
