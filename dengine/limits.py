@@ -73,6 +73,7 @@ class ForceLimits:
         )
 
     def __str__(self) -> str:
+        """Return the text form, which `parse` reads; infinite limits are empty."""
         fields = [
             "" if math.isinf(value) else repr(float(value)).removesuffix(".0")
             for value in (self.start, self.end, self.low, self.high)

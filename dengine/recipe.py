@@ -66,6 +66,11 @@ class ReducerDefault:
         self.field_name = field_name
 
     def __get__(self, recipe: Recipe | None, owner: type) -> Any:
+        """Return the field's value, or the reducer's checked default if that is None.
+
+        Read from the class itself it is None. Raises SettingError if the reducer's class cannot be
+        imported, or its default is refused.
+        """
         if recipe is None:
             return None  # the default, as `dataclass` reads it
         value = vars(recipe)[self.field_name]
@@ -75,13 +80,18 @@ class ReducerDefault:
         return value
 
     def __set__(self, recipe: Recipe, value: Any) -> None:
+        """Set the field, after the check; None is set without a check."""
         if value is not None:
             self.check(value)  # or every retrain would fail, one by one
         vars(recipe)[self.field_name] = value
 
 
 def _check_integer(name: str, value: Any) -> None:
-    """Raise SettingError for a value that the integer setting `name` of a recipe cannot have."""
+    """Raise SettingError for a value that the integer setting `name` of a recipe cannot have.
+
+    It must be an integer, not a boolean, in the range that `INTEGER_RANGES` has for the name, both
+    ends included.
+    """
     least, most = INTEGER_RANGES[name]
     expect(
         is_whole(value, least, most),

@@ -439,7 +439,7 @@ def source_of(decision: Decision, success: bool) -> Source:
 def is_name(value: Any) -> bool:
     """Return whether a value may be an id or a part's number.
 
-    Both are texts of 1 to `LONGEST` printable characters.
+    Both are texts of 1 to 200 (`LONGEST`) printable characters.
     """
     return isinstance(value, str) and 1 <= len(value) <= LONGEST and value.isprintable()
 

@@ -194,7 +194,7 @@ class Constant(Baseline):
     def fit(self, X: ArrayLike, y: ArrayLike) -> Self:
         """Learn nothing, count as trained from now on, and return self.
 
-        Labels of one class, or none, are enough.
+        X and y are not read, so labels of one class, or none, are enough.
         """
         self._last = None
         self.is_trained = True

@@ -365,7 +365,11 @@ def candidates(
     policy = contender.recipe.policy
 
     def levels(factors: Sequence[float]) -> Sequence[float]:
-        """Return the user's levels of LB, or those of these factors, the laxest first."""
+        """Return the user's levels of LB, or those of these factors, the laxest first.
+
+        A factor gives the tolerance 1 - LB, in units of check / escape, rounded to two digits.
+        Tolerances above 20 % are left out; if all are, 20 % is the only one.
+        """
         tolerances = [factor * costs.worst_accept for factor in factors]
         allowed = [share for share in tolerances if share <= LARGEST_TOLERANCE]
         shares = allowed or [LARGEST_TOLERANCE]
@@ -567,8 +571,10 @@ def _finished(replays: Iterable[Replay], policies: Sequence[Policy]) -> Groups:
 
 
 def _check_search(data: Dataset, costs: Costs, repeats: int) -> None:
-    """Raise SettingError if no policy can be chosen: by these prices, by recordings of one label,
-    or by fewer than two repeats.
+    """Raise SettingError if no policy can be chosen.
+
+    That is so for fewer than two repeats, a check that costs as much as an escape or more, a false
+    reject that costs nothing, and recordings of one label.
     """
     expect(repeats >= 2, "2 or more repeats", repeats, "one says nothing of luck")
     expect(

@@ -258,12 +258,15 @@ def window_curves(replays: Sequence[Replay], window: int = WINDOW, fewest: int =
     certain = is_certain.astype(float).rolling(window, min_periods=1).mean()
 
     def count(name: str) -> pd.Series[float]:
-        """Return how many cycles a field marks in each window, over all replays."""
+        """Return how many cycles a field marks in each window, summed over all replays."""
         marks = np.sum([getattr(replay, name) for replay in replays], axis=0)
         return pd.Series(marks).rolling(window, min_periods=1).sum()
 
     def share(wrong: str, decided: str) -> pd.Series[float]:
-        """Return the share of wrong ones of those decided, in the windows of all replays."""
+        """Return the share of wrong ones of those decided, in the windows of all replays.
+
+        It is NaN in a window with fewer than `fewest` of them, or none.
+        """
         n_decided = count(decided)
         return (count(wrong) / n_decided).where(n_decided >= fewest)
 

@@ -217,9 +217,11 @@ class Replay:
     seconds: float = float("nan")
 
     def __len__(self) -> int:
+        """Return the number of finished cycles."""
         return len(self.action)
 
     def __repr__(self) -> str:
+        """Return one line: name, policy, cycles, decisions, errors, and dropped retrains if any."""
         counts = self.stretch()
         summary = ", ".join(f"{counts[name]} {name.replace('_', ' ')}" for name in COUNTED[:5])
         cycles = f"{self.recipe.policy.summary}, {len(self)} cycles"

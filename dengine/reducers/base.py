@@ -257,7 +257,7 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
         """Embed traces (n, C, T) in every space; return float32 (n, K, d).
 
         Space k is fitted without the labels of fold k. By default there is one space, in which a
-        trace lies where `transform` puts it.
+        trace lies where `transform` puts it; it raises what `transform` raises.
         """
         return as_points(self.transform(X))[:, None, :]
 

@@ -130,5 +130,5 @@ class PcaEncoder(nn.Module):
         self.register_buffer("components", components.T.contiguous())
 
     def forward(self, x: Tensor) -> Tensor:
-        """Raw traces (B, C, T) -> (B, 1, n_components)."""
+        """Raw traces (B, C, T), less the mean, on the axes -> (B, 1, n_components)."""
         return ((x.flatten(1) - self.mean) @ self.components).unsqueeze(1)

@@ -153,7 +153,7 @@ class RocketEncoder(nn.Module):
             self.register_buffer(name, value, persistent=False)
 
     def forward(self, x: Tensor) -> Tensor:
-        """(B, C, T) raw traces -> (B, P) scaled features."""
+        """Raw traces (B, C, T) -> standardised, clipped features (B, P)."""
         return self.scale_features(self.raw_features(x))
 
     def raw_features(self, x: Tensor) -> Tensor:

@@ -441,8 +441,8 @@ class TorchReducer(ProbabilityReducer):
     def _embed_in_fold_space(self, x: Tensor, folds: Ints) -> Floats:
         """Embed preprocessed traces (n, C', L), each in one embedding space: float32 (n, d).
 
-        Row i is in space ``folds[i]``, as a reference. Network k computes the rows of fold k alone,
-        so this takes 1 / K of the time of `embed`.
+        Row i is in space ``folds[i]``, as a reference; folds must be 0 to K - 1. Network k computes
+        the rows of fold k alone, so this takes 1 / K of the time of `embed`.
         """
         rows_of_fold = [torch.from_numpy(np.flatnonzero(folds == k)) for k in range(self.folds)]
         points = torch.empty(len(x), self.n_components)

@@ -129,7 +129,7 @@ class UmapEncoder(nn.Module):
         self.register_buffer("rates", torch.logspace(-2.0, 3.0, 48))
 
     def forward(self, x: Tensor) -> Tensor:
-        """(B, C, T) raw -> (B, 1, dim)."""
+        """Raw traces (B, C, T) -> points in the only space (B, 1, dim); see `embed_frames`."""
         return self.embed_frames(self.make_frames(x)).unsqueeze(1)
 
     @torch.jit.export
@@ -422,7 +422,7 @@ class UmapReducer(Reducer):
     def _set_references(self, neighbors: Neighbors, points: Tensor) -> None:
         """Make traces and their points (n, n_components) the references of a new encoder.
 
-        `neighbors` holds the frames of the traces and their nearest neighbours. It replaces
+        `neighbors` holds the frames of the traces and their nearest neighbours. This replaces
         `neighbors_`, `embedding_` and `encoder_`, and drops what `precompute` found.
         """
         self.neighbors_ = neighbors

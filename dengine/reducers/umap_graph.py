@@ -124,7 +124,10 @@ class Neighbors:
         )
 
     def rows_of(self, numbers: Ints) -> Tensor:
-        """Return the row of each number (m,) as int64 (m,); -1 if `numbers` lacks the number."""
+        """Return in which row of this object each label number of an array (m,) is: int64 (m,).
+
+        It is -1 for a number that this object does not have. The numbers may be in any order.
+        """
         row = np.searchsorted(self.numbers, numbers)
         return torch.from_numpy(np.where(np.isin(numbers, self.numbers), row, -1))
 
