@@ -51,12 +51,14 @@ def hash_weights(size: int) -> FoldArray:
 def content_hash(X: NDArray[np.floating]) -> FoldArray:
     """Hash the content of traces, a weighted sum of the samples that wraps around at 64 bits.
 
-    Each sample is first clipped to ±2**46 and rounded down to 1/65,536 of its unit.
+    Each sample is first cast to float32, clipped to ±2**46 and rounded down to 1/65,536 of its
+    unit. Traces that are equal after this have equal hashes.
 
     Parameters
     ----------
     X : array of float, shape (n, T) or (n, C, T)
-        Samples that are not finite count as zero.
+        A trace is read channel after channel. Samples that are not finite, in float32, count as
+        zero. n may be 0.
 
     Returns
     -------
@@ -76,6 +78,9 @@ def content_hash(X: NDArray[np.floating]) -> FoldArray:
 
 def part_hash(part: str) -> int:
     """Hash the number of a part, a text, to a signed 64-bit integer that is never 0.
+
+    A hash of 0 would stand for an unknown part, so it becomes 1. Equal texts have equal hashes, in
+    every process. Raises UnicodeEncodeError for a text that is not valid Unicode.
 
     References
     ----------
@@ -106,15 +111,24 @@ def toss(hashes: FoldArray | int, salt: int = 0) -> FoldArray:
 
 
 def fold_of(hashes: FoldArray | int, folds: int) -> FoldArray:
-    """Return the fold of each hash, 0 .. folds - 1, in the shape of the hashes."""
+    """Return the fold of each hash, 0 .. folds - 1, as int64 in the shape of the hashes.
+
+    The fold depends on the hash and the number of folds alone, so it stays for life.
+    """
     return toss(hashes) % folds
 
 
 def content_fold(X: NDArray[np.floating], folds: int) -> FoldArray:
-    """Return the fold of each trace of (n, T) or (n, C, T) by its content, shape (n,)."""
+    """Return the fold of each trace of (n, T) or (n, C, T) by its content, int64 (n,).
+
+    A fold is 0 .. folds - 1. Equal traces are in one fold, whatever their parts' numbers.
+    """
     return fold_of(content_hash(X), folds)
 
 
 def audit_salt(seed: int) -> int:
-    """Return the salt of `toss` for audits under a seed; it differs from the folds' salt, 0."""
+    """Return the salt of `toss` for audits under a seed; it differs from the folds' salt, 0.
+
+    Only the lowest 31 bits of the seed count.
+    """
     return AUDIT_SALT ^ (seed & 0x7FFFFFFF)

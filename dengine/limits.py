@@ -43,7 +43,10 @@ class ForceLimits:
     Raises
     ------
     SettingError
-        For values that describe no limits.
+        For values that describe no limits: NaN, `start` above `end` or not finite, `low` above
+        `high` or both infinite, a `reject` that is no boolean, or a channel that is no index from 0
+        to 1e9 and no name. A name is 1 to 200 printable characters, not digits alone, without a
+        blank, a colon or `=`. Whether the channel exists is not checked here.
     """
 
     start: float
@@ -70,6 +73,7 @@ class ForceLimits:
         )
 
     def __str__(self) -> str:
+        """Return the text form, which `parse` reads; infinite limits are empty."""
         fields = [
             "" if math.isinf(value) else repr(float(value)).removesuffix(".0")
             for value in (self.start, self.end, self.low, self.high)
@@ -87,9 +91,10 @@ class ForceLimits:
         """Return the limits that a text START:END:LOW:HIGH describes; `str` writes this text.
 
         The four numbers are `start`, `end`, `low` and `high` of the class. An empty LOW or HIGH
-        means no limit. `:channel=1`, `:along=2` and `:reject` may follow, and set the fields of
-        these names. A channel in digits is an index, any other text is a name. Raises SettingError
-        for a text of another form, and for values that `ForceLimits` refuses.
+        means no limit, but not both; START and END must be given. `:channel=1`, `:along=2` and
+        `:reject` may follow in any order, and set the fields of these names. A channel in digits is
+        an index, any other text is a name. Raises SettingError for a text of another form, and for
+        values that `ForceLimits` refuses.
         """
         fields = text.split(":")
         options: dict[str, Any] = {}

@@ -48,13 +48,15 @@ OBJECT_PREFIX = "object "  # before the class name of a reducer that TOML cannot
 class ReducerDefault:
     """Descriptor of a field of `Recipe` whose default is an attribute of the reducer's class.
 
-    Where the field `radius` is None, reading it gives the `default_radius` of the class, see
-    `Reducer`. The class is imported only then, so that naming a reducer imports nothing.
+    If the field `radius` is None, reading it gives the `default_radius` of the class, see
+    `Reducer`. The class is imported only then, so that naming a reducer imports nothing;
+    SettingError if it cannot be imported. The field itself stays None.
 
     Parameters
     ----------
     check : callable
-        Raises SettingError for a value out of range.
+        Raises SettingError for a value out of range. It is called with each value but None that the
+        field is set to, and with each default that is read.
     """
 
     def __init__(self, check: Callable[[Any], None]) -> None:
@@ -64,6 +66,11 @@ class ReducerDefault:
         self.field_name = field_name
 
     def __get__(self, recipe: Recipe | None, owner: type) -> Any:
+        """Return the field's value, or the reducer's checked default if that is None.
+
+        Read from the class itself it is None. Raises SettingError if the reducer's class cannot be
+        imported, or its default is refused.
+        """
         if recipe is None:
             return None  # the default, as `dataclass` reads it
         value = vars(recipe)[self.field_name]
@@ -73,13 +80,18 @@ class ReducerDefault:
         return value
 
     def __set__(self, recipe: Recipe, value: Any) -> None:
+        """Set the field, after the check; None is set without a check."""
         if value is not None:
             self.check(value)  # or every retrain would fail, one by one
         vars(recipe)[self.field_name] = value
 
 
 def _check_integer(name: str, value: Any) -> None:
-    """Raise SettingError for a value that the integer setting `name` of a recipe cannot have."""
+    """Raise SettingError for a value that the integer setting `name` of a recipe cannot have.
+
+    It must be an integer, not a boolean, in the range that `INTEGER_RANGES` has for the name, both
+    ends included.
+    """
     least, most = INTEGER_RANGES[name]
     expect(
         is_whole(value, least, most),
@@ -98,14 +110,16 @@ class Recipe:
     reducer : str or estimator, default "conv"
         A name in `REDUCERS`, `module:Class` of your own, or a scikit-learn transformer.
     params : mapping, default {}
-        Parameters of the reducer, if it is given by name. The reducer checks them when it is made.
+        Parameters of the reducer, if it is given by name. The names consist of letters, digits,
+        `_` and `-`; the values are booleans, numbers, texts or None. The reducer checks them when
+        it is made.
     policy : Policy
         Error level, lower bound, interval, decision rule, audit rate.
     radius : float, optional
         Radius of the neighbourhood whose labels count, in units of the scaled embedding. None:
         the reducer's `default_radius`.
     folds : int, default 5
-        Number of folds, and of spaces, of a reducer that trains with labels.
+        Number of folds, and of spaces, of a reducer that trains with labels; 2 to 1000.
     retrain_every : int, optional
         New labels between two retrains. None: the reducer's `default_retrain_every`.
     budget : float, default 0.45
@@ -114,7 +128,8 @@ class Recipe:
         Optimiser steps of a retrain at most. None: the reducer's own limit. A replay stops on
         steps alone, so that it repeats exactly.
     window : int, default 10_000
-        Number of the newest labelled traces, good or bad, that are used in training and counted.
+        Number of the newest labelled traces, good or bad, that are used in training and counted; at
+        least 10.
     novelty : float, default 1.5
         Factor of the limits of novelty. A trace is novel if its squared distance to the nearest
         learned trace is above a limit, by any of four measures. The limit is this factor times the
@@ -124,7 +139,8 @@ class Recipe:
     Raises
     ------
     SettingError
-        For a value out of its range.
+        For a value out of its range or of another type. Whether a named reducer exists is only
+        found out when its class is imported.
     """
 
     reducer: Any = "conv"
@@ -176,13 +192,16 @@ class Recipe:
 
     @property
     def name(self) -> str:
-        """Name of the recipe in tables: its reducer's name, or the class name of an object."""
+        """Name of the recipe in tables: the text that names its reducer, like "conv" or
+        `module:Class`, or the class name of an object.
+        """
         return self.reducer if isinstance(self.reducer, str) else type(self.reducer).__name__
 
     @property
     def user_classes(self) -> list[str]:
-        """The `module:Class` of its reducer and decision rule, without classes of dengine.
+        """The `module:Class` of its reducer and then of its decision rule, if they are the user's.
 
+        Classes of dengine and names like "conv" or "local" are left out, so the list may be empty.
         A reducer that is an object is named if `to_toml` writes it as `module:Class`.
         """
         return [
@@ -237,9 +256,9 @@ class Recipe:
 
         Settings that are missing get their defaults, and "none" is read as None, but not in
         [policy], which has no None. The policy's "windows", the name in earlier versions, is read
-        as "force_limits". No class of a reducer is imported, so an unknown reducer is not noticed
-        here. Raises SettingError for text that is not TOML, an unknown key or a value out of range.
-        `where` is the recipe's name in errors.
+        as "force_limits". No class is imported, so an unknown reducer or `module:Class` is not
+        noticed here. Raises SettingError for text that is not TOML, an unknown key or a
+        value out of range. `where` is the recipe's name in errors.
         """
         # tomllib raises ValueError for huge integers, too.
         with instead(SettingError, f"{where} is not TOML", ValueError, RecursionError):
@@ -312,7 +331,7 @@ class Recipe:
 
         A `radius` or `retrain_every` that is None in this recipe becomes the reducer's default.
         Raises SettingError for a policy's value out of range, and if the class of the reducer must
-        be imported for its defaults, and cannot be.
+        be imported for its defaults, and cannot be; TypeError for an unknown setting.
         """
         return replace(self, policy=self.policy.changed(**changes))
 
@@ -392,8 +411,8 @@ def _name_and_params(reducer: Any, params: Params) -> tuple[str, Params]:
 def describe_estimator(estimator: Any) -> str:
     """Return an estimator as text: its class and all parameters, also nested ones, sorted by name.
 
-    If a value is no boolean, number, text or None, only its class is named, so that the text is the
-    same in every process.
+    It looks like `MyReducer(kind='a', width=3)`. If a value is no boolean, number, text or None,
+    only its class is named, so that the text is the same in every process.
     """
     values = (
         f"{name}={value!r}"

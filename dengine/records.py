@@ -27,16 +27,19 @@ Arrays = Mapping[str, NDArray[Any]]  # the same, only read
 
 
 def is_whole(value: Any, least: int, most: int) -> bool:
-    """Return whether a value is an integer, Python's or NumPy's, from `least` to `most`."""
+    """Return whether a value is an integer, Python's or NumPy's, from `least` to `most`.
+
+    Both ends are included. True, False and floats such as 1.0 are no integers here.
+    """
     if not isinstance(value, Integral) or isinstance(value, bool):
         return False
     return least <= int(value) <= most
 
 
 def is_number(value: Any) -> bool:
-    """Return whether a value is a real number that a float can hold.
+    """Return whether a value is a real number, Python's or NumPy's, that a float can hold.
 
-    Infinities and NaN are; True and 10**400 are not.
+    Infinities and NaN are; True, 10**400, complex numbers and texts are not.
     """
     if not isinstance(value, Real) or isinstance(value, bool):
         return False
@@ -118,25 +121,28 @@ class TraceSpec:
     Parameters
     ----------
     samples : int
-        Samples per channel.
+        Samples per channel, 1 to 1e9.
     rate_hz : float, optional
-        Sampling rate in hertz. None: unknown.
+        Sampling rate in hertz, above 0 and finite. None: unknown.
     channels : int, default 1
-        Number of channels. A trace of one channel may have the shape `(samples,)`.
+        Number of channels, 1 to 1e9. A trace of one channel may have the shape `(samples,)`.
     unit : str or tuple of str, optional
         Unit of the samples, shown to people and used by `limit`: one unit for all channels, or one
         for each, for example ("kN", "mm") or "kN, mm"; "" for a channel of an unknown unit. None:
-        unknown.
+        unknown. Blanks around a unit are dropped. The field then holds a tuple only if the units
+        differ; equal ones become one text, and unknown ones None. A text with commas that does not
+        name a unit for each channel is kept as one unit of all.
     limit : float, optional
-        Range of the sensor, in `unit`: a sample at or beyond ±limit is saturated. None: not
-        checked.
+        Range of the sensor, in `unit`, above 0: a sample at or beyond ±limit is saturated. None:
+        not checked.
     fit : {"strict", "cut", "pad", "resample"}, default "strict"
         What happens to a trace of another length, see `traces.fit_length`. strict: TraceError. cut:
         a longer trace loses its end. pad: like cut, and a shorter trace repeats its last sample.
         resample: linear interpolation. A trace of half to twice the length can be padded or
         resampled; any other length is a TraceError.
     columns : tuple of str, default ()
-        Names of the channels, by which the columns of a DataFrame are selected.
+        Names of the channels, by which the columns of a DataFrame are selected: none, or one for
+        each channel. A single text becomes a tuple of one.
 
     Raises
     ------
@@ -208,8 +214,9 @@ class TraceSpec:
     def completed(self, other: "TraceSpec | None") -> "TraceSpec":
         """Return a copy whose unknown rate, units and columns are taken from another `TraceSpec`.
 
-        What this `TraceSpec` states is kept, also each single unit. It is returned unchanged if
-        `other` is None or has another number of samples or channels.
+        What this `TraceSpec` states is kept, also each single unit; `limit` and `fit` are never
+        taken. It is returned unchanged if `other` is None or has another number of samples or
+        channels.
         """
         if other is None or (self.samples, self.channels) != (other.samples, other.channels):
             return self
@@ -372,12 +379,13 @@ LONGEST = 200  # characters of an id, or of a part's number
 
 
 def as_success(value: Any, owner: str = "") -> bool:
-    """Convert a label to bool.
+    """Convert a label to bool, True for success, and return it. Nothing is stored.
 
     Parameters
     ----------
     value : object
-        A bool, or a number or 0-d array that is exactly 1 or 0. Nothing else is guessed at:
+        A bool, Python's or NumPy's, or a real number or 0-d array that is exactly 1 or 0. Nothing
+        else, such as a text, None or NaN, is guessed at:
         `bool("NG")` is True, and -1 is what some controllers call true.
     owner : str
         Whose label it is, for the error: "decision 1a2b".
@@ -431,7 +439,7 @@ def source_of(decision: Decision, success: bool) -> Source:
 def is_name(value: Any) -> bool:
     """Return whether a value may be an id or a part's number.
 
-    Both are texts of 1 to `LONGEST` printable characters.
+    Both are texts of 1 to 200 (`LONGEST`) printable characters.
     """
     return isinstance(value, str) and 1 <= len(value) <= LONGEST and value.isprintable()
 

@@ -49,8 +49,9 @@ def toy_traces(
 ) -> tuple[Floats, Ints]:
     """Make traces of two curve shapes with noise, and their labels.
 
-    The force of a success rises late, when the part reaches the bottom of the hole. The force of a
-    failure rises early, at the edge of the hole.
+    The force of a success rises late, when the part reaches the bottom of the hole: about 70 % of
+    the way through the trace. The force of a failure rises early, at the edge of the hole: at about
+    35 %. It rises from 0 to about 20 N, at the same time in all channels.
 
     Parameters
     ----------
@@ -306,6 +307,6 @@ def _train_clone(reducer: Any, times: int = 1, labels: Ints | None = None) -> Re
 def _decide_all(engine: DataEngine, X: Floats) -> list[Decision]:
     """Let an engine decide on each trace of X, (n, C, T); return the decisions without their ids.
 
-    The engine records the decisions.
+    The engine records the decisions, so they also count in its status and its store.
     """
     return [replace(engine.decide(x), id="") for x in X]

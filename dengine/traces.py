@@ -34,21 +34,24 @@ def as_trace(trace: Any, trace_spec: TraceSpec | None) -> TraceArray:
     Parameters
     ----------
     trace : array, shape (samples,) or (channels, samples)
-        Of any real dtype.
+        Of any real dtype, or booleans. Without an axis of channels it has one channel. A value too
+        large for float32 becomes an infinity.
     trace_spec : TraceSpec or None
-        What the trace must look like. Another length is fitted as `trace_spec.fit` says. None: any
-        shape with no more channels than samples, and with at least one sample.
+        What the trace must look like. Another length is fitted as `trace_spec.fit` says, into a
+        copy. None: any shape with no more channels than samples, and with at least one sample.
 
     Returns
     -------
     array of float32, shape (C, T)
-        Contiguous and writeable. It shares its memory with `trace` if that is such an array.
+        Contiguous and writeable. It shares its memory with `trace` if that is such an array, and
+        its length is not fitted. `trace` is never changed.
 
     Raises
     ------
     TraceError
-        For a trace of another shape, and for values that are no real numbers. NaN and infinities
-        pass; `TraceGate` finds them.
+        For a trace of another shape, for a length that `trace_spec.fit` does not allow, for rows
+        of different lengths, and for values that are no real numbers. NaN and infinities pass;
+        `TraceGate` finds them.
     """
     x = _with_channels(trace, 2, "one trace, (samples,) or (channels, samples)")
     if trace_spec is not None:
@@ -69,7 +72,8 @@ def as_traces(X: ArrayLike, trace_spec: TraceSpec | None = None) -> TraceArray:
     Parameters
     ----------
     X : array, shape (n, samples) or (n, channels, samples)
-        Of any real dtype. n may be 0, but not the other axes.
+        Of any real dtype, or booleans. n may be 0, but not the other axes. (n, samples) has one
+        channel. A value too large for float32 becomes an infinity.
     trace_spec : TraceSpec, optional
         What the traces must look like; another length is fitted as `trace_spec.fit` says. None: any
         shape, also one with more channels than samples.
@@ -77,12 +81,14 @@ def as_traces(X: ArrayLike, trace_spec: TraceSpec | None = None) -> TraceArray:
     Returns
     -------
     array of float32, shape (n, C, T)
-        Contiguous; it may share its memory with X, if that is float32 already.
+        Contiguous; it may share its memory with X, if that is float32 already, and is then
+        read-only if X is.
 
     Raises
     ------
     TraceError
-        For another shape, or values that are no real numbers. NaN and infinities pass.
+        For another shape, a length that `trace_spec.fit` does not allow, traces of different
+        lengths, or values that are no real numbers. NaN and infinities pass.
     """
     x = _with_channels(X, 3, "traces (n, samples) or (n, channels, samples)")
     if trace_spec is not None:
@@ -93,7 +99,8 @@ def as_traces(X: ArrayLike, trace_spec: TraceSpec | None = None) -> TraceArray:
 def as_labels(y: ArrayLike) -> Ints:
     """Convert labels, shape (n,), to int64: 1 for success, 0 for failure; booleans are accepted.
 
-    Raises DataError if there is any other value.
+    Floats 1.0 and 0.0 are accepted, too. The result is a new array of the same shape, empty for no
+    labels. Raises DataError if there is any other value, such as NaN, -1 or the text "1".
     """
     labels = np.asarray(y)
     if not np.isin(labels, (0, 1)).all():
@@ -117,11 +124,13 @@ def fit_length(x: Tensor, samples: int, fit: int) -> Tensor:
     fit : int
         1 "cut", 2 "pad" or 3 "resample", the position in `FITS`. The first two keep each sample's
         time from the start: both drop the end of a longer trace, and "pad" repeats the last sample
-        of a shorter one. "resample" interpolates the whole trace linearly.
+        of a shorter one. "resample" interpolates the whole trace linearly; its first and its last
+        sample stay the first and the last.
 
     Returns
     -------
     Tensor of float32, shape (..., samples)
+        A copy, also if the length is the same. Nothing is checked here.
     """
     last = x.size(-1) - 1
     if fit != 3:
@@ -137,7 +146,7 @@ def can_fit_length(length: int, samples: int, fit: int) -> bool:
     """Return whether a trace of `length` samples may be fitted to a length of `samples`.
 
     `fit` is a position in `FITS`: 0 "strict" allows only the same length, 1 "cut" the same or a
-    greater length, 2 "pad" and 3 "resample" allow half to twice `samples`.
+    greater length, 2 "pad" and 3 "resample" allow half to twice `samples`, both included.
     """
     if fit == 0:
         return length == samples
@@ -224,10 +233,11 @@ def clip_extremes(traces: TraceArray) -> TraceArray:
     Returns
     -------
     array of float32, shape (n, C, T)
-        The same array if nothing was clipped, else a copy. Each channel has its own limit for the
-        absolute value of a sample. A trace's greatest absolute value is its peak; the limit is the
-        least power of four that is at least 64 times the peak which nine in ten traces do not
-        exceed, but at most 1e15, so that float32 can sum squares. If that peak is 0, it is 1e15.
+        The same array if nothing was clipped or n is 0, else a copy. Each channel has its own limit
+        for the absolute value of a sample. A trace's greatest absolute value is its peak; the limit
+        is the least power of four that is at least 64 times the peak which nine in ten traces do
+        not exceed, but at most 1e15, so that float32 can sum squares. If that peak is 0, it is
+        1e15.
     """
     if not len(traces):
         return traces
@@ -273,8 +283,9 @@ class TraceGate(nn.Module):
         Parameters
         ----------
         x : Tensor of float32, shape (C, T)
+            Contiguous, with `size` samples in all. It is not changed.
         limit : float
-            Range of the sensor, as `TraceSpec.limit`; infinity: no range is checked.
+            Range of the sensor, like `TraceSpec.limit`; infinity: no range is checked.
 
         Returns
         -------
@@ -328,7 +339,8 @@ WITHIN_LIMITS = -1  # in place of an `ActionCode`
 class ForceLimitsGate(nn.Module):
     """Finds whether a trace leaves the operator's limits.
 
-    The engine and exported files run this one module, scripted.
+    The engine and exported files run this one module, scripted. It compares in float32, the times
+    included. A channel is named by its index or by the name of its column.
 
     Parameters
     ----------
@@ -407,7 +419,8 @@ def infer_trace_spec(x: TraceArray) -> tuple[TraceSpec, bool]:
     -------
     trace_spec : TraceSpec
     is_faultless : bool
-        Whether the trace has no fault. The `TraceSpec` of a faulty trace should not be kept.
+        Whether the trace has no fault: all samples are finite, none is beyond 1e18, and they are
+        not all equal. The `TraceSpec` of a faulty trace should not be kept.
 
     Raises
     ------

@@ -103,9 +103,10 @@ class Baseline(ABC):
     def add(self, x: ArrayLike, y: Any) -> Self:
         """Learn one trace `x` (C, T) with its label `y`, 1 for success, and return self.
 
-        Nothing is learned or checked before a training has succeeded; nothing is learned if the
-        method learns only in `fit`. Raises TraceError for values that are no trace. It is not
-        checked here that the trace is as long as those of the training.
+        Any other label is a failure. Nothing is learned or checked before a training has succeeded;
+        nothing is learned if the method learns only in `fit`. The cached prediction is dropped.
+        Raises TraceError for values that are no trace. It is not checked here that the trace is as
+        long as those of the training.
         """
         self._last = None
         if self.is_trained:
@@ -134,9 +135,9 @@ class Baseline(ABC):
         """Return an `Action` for each trace of X (n, C, T), as an array of objects, shape (n,).
 
         It is ACCEPT if the lower bound of the success probability is at least the accept threshold,
-        REJECT if the upper bound is at most the reject threshold, and otherwise VERIFY. The
-        attribute `thresholds` has both; if it is None, they are LB and 1 - LB. Raises TraceError
-        like `predict`.
+        REJECT if the upper bound is at most the reject threshold, and otherwise VERIFY. If both
+        hold, it is ACCEPT. The attribute `thresholds` has both; if it is None, they are LB and 1 -
+        LB. Raises TraceError like `predict`.
         """
         default = (self.policy.lower_bound, 1.0 - self.policy.lower_bound)
         accept_threshold, reject_threshold = self.thresholds or default
@@ -149,12 +150,12 @@ class Baseline(ABC):
     def predict(self, X: ArrayLike) -> BaselinePrediction:
         """Return bounds of the success probability, and counts of labels, for traces X (n, C, T).
 
-        The last result is cached: it is returned again for the same traces until the next `fit` or
-        `add`. Before a training has succeeded, all bounds are 0 and 1. A baseline that counts no
-        labels returns the integer 0, and no array, for both counts; so does an untrained one.
-        Traces (n, T) have one channel. Raises TraceError if X has neither shape, or has values that
-        are no real numbers. It is not checked here that the traces are as long as those of the
-        training.
+        The last result is cached: the same object is returned again for the same traces until the
+        next `fit` or `add`, so do not change it. Before a training has succeeded, all bounds are 0
+        and 1. A baseline that counts no labels returns the integer 0, and no array, for both
+        counts; so does an untrained one. Traces (n, T) have one channel. Raises TraceError if X has
+        neither shape, or has values that are no real numbers. It is not checked here that the
+        traces are as long as those of the training.
         """
         traces = as_traces(X)
         key = traces.shape, traces.tobytes()
@@ -169,25 +170,31 @@ class Baseline(ABC):
 
     @abstractmethod
     def _fit(self, X: Traces, good: Labels) -> bool:
-        """Train on traces (n, C, T), labels (n,) of both classes; return False if too few."""
+        """Train from scratch on traces (n, C, T) and labels (n,) of both classes, True for success.
+
+        Return whether the labels were enough; if not, every part is verified.
+        """
 
     @abstractmethod
     def _predict(self, X: Traces) -> BaselinePrediction:
-        """Return the prediction for traces (n, C, T), after a training."""
+        """Return the prediction for traces (n, C, T); called only after a successful training."""
 
     def _add(self, X: Traces, good: bool) -> None:  # noqa: B027  # default: nothing
-        """Learn one trace (1, C, T) between two trainings."""
+        """Learn one trace (1, C, T) between two trainings; the default does nothing."""
 
 
 class Constant(Baseline):
-    """The same prediction for every part, after the first retrain."""
+    """The same prediction for every part, after the first retrain.
+
+    Before it every part is verified. A subclass sets `lower`; the upper bound is 1.
+    """
 
     lower: ClassVar[float]
 
     def fit(self, X: ArrayLike, y: ArrayLike) -> Self:
         """Learn nothing, count as trained from now on, and return self.
 
-        Labels of one class, or none, are enough.
+        X and y are not read, so labels of one class, or none, are enough.
         """
         self._last = None
         self.is_trained = True
@@ -216,13 +223,13 @@ class NeverVerify(Constant):
 
 @dataclass
 class LabelledPoints:
-    """Points (n, d) with labels (n,), to which more can be added."""
+    """Points, float64 (m, d), with labels, bool (m,), to which more can be added."""
 
     points: Floats
     good: Labels
 
     def add(self, point: Floats, good: bool) -> None:
-        """Append one point (1, d) with its label."""
+        """Append one point (1, d) with its label; both arrays are replaced by longer copies."""
         self.points = np.concatenate([self.points, point])
         self.good = np.append(self.good, good)
 
@@ -261,6 +268,7 @@ class AgreeingNeighbours(Baseline):
         self.thresholds = (1.0, 0.0)
 
     def _fit(self, X: Traces, good: Labels) -> bool:
+        """Keep all labelled traces (n, C, T); return whether there are at least `k`."""
         self._references = LabelledPoints(_rows(X), good)
         return len(good) >= self.k
 
@@ -309,7 +317,8 @@ def make_baseline(name: str, policy: Policy, seed: int = 0, **params: Any) -> Ba
     Raises
     ------
     SettingError
-        An unknown name or parameter, a value out of range, or a class that cannot be imported.
+        An unknown name or parameter, a value out of range, or a class that cannot be imported or is
+        no `Baseline`. Other errors of a user's constructor pass unchanged.
     """
     kind = baseline_class(name)
     names = [item.name for item in fields(kind) if item.kw_only]
@@ -323,7 +332,8 @@ def baseline_class(name: str) -> type[Baseline]:
     """Return the class of a baseline by its name in `BASELINES`, or import it from `module:Class`,
     which runs the module's code.
 
-    Raises SettingError for an unknown name, a class that cannot be imported, or no `Baseline`.
+    A name with a colon is always imported. Raises SettingError for an unknown name, a class that
+    cannot be imported, or one that is no subclass of `Baseline`.
     """
     kind = import_class(name) if ":" in name else BASELINES.get(name, object)
     if not issubclass(kind, Baseline):

@@ -101,12 +101,15 @@ class PolicyCost:
 
     @property
     def escaped(self) -> float:
-        """Share of all parts that were accepted and bad."""
+        """Share of all parts that were accepted and bad, from 0 to 1; 0 if none was accepted."""
         return self.accepted * self.bad.rate if self.bad.decided else 0.0
 
     @property
     def screening_key(self) -> tuple[bool, float]:
-        """Whether nothing was decided, so that such policies are sorted last; the expected cost."""
+        """Key by which the halving sorts policies: (whether nothing was decided, expected cost).
+
+        Policies that verified every part come last, and among the others the cheapest first.
+        """
         return self.accepted + self.rejected == 0.0, self.expected_cost
 
 
@@ -284,7 +287,10 @@ class CostCurve:
 
     @property
     def price_sentence(self) -> str:
-        """Whether another policy would be chosen if one price were half or twice as large."""
+        """A sentence: would the choice be another one if one price were half or twice as large?
+
+        It lists `price_changes`, or says that the choice stays if there are none.
+        """
         if not self.price_changes:
             return "If one price is half or twice as large, the choice stays."
         return f"The choice depends on the prices: {'; '.join(self.price_changes)}."
@@ -359,7 +365,11 @@ def candidates(
     policy = contender.recipe.policy
 
     def levels(factors: Sequence[float]) -> Sequence[float]:
-        """Return the user's levels of LB, or those of these factors, the laxest first."""
+        """Return the user's levels of LB, or those of these factors, the laxest first.
+
+        A factor gives the tolerance 1 - LB, in units of check / escape, rounded to two digits.
+        Tolerances above 20 % are left out; if all are, 20 % is the only one.
+        """
         tolerances = [factor * costs.worst_accept for factor in factors]
         allowed = [share for share in tolerances if share <= LARGEST_TOLERANCE]
         shares = allowed or [LARGEST_TOLERANCE]
@@ -561,8 +571,10 @@ def _finished(replays: Iterable[Replay], policies: Sequence[Policy]) -> Groups:
 
 
 def _check_search(data: Dataset, costs: Costs, repeats: int) -> None:
-    """Raise SettingError if no policy can be chosen: by these prices, by recordings of one label,
-    or by fewer than two repeats.
+    """Raise SettingError if no policy can be chosen.
+
+    That is so for fewer than two repeats, a check that costs as much as an escape or more, a false
+    reject that costs nothing, and recordings of one label.
     """
     expect(repeats >= 2, "2 or more repeats", repeats, "one says nothing of luck")
     expect(
@@ -617,7 +629,7 @@ def _within_reach(
 
 
 def _by_policy(replays: Iterable[Replay]) -> dict[Policy, list[Replay]]:
-    """Return the replays of each policy, in their order."""
+    """Return the replays of each policy, in their order; policies in the order of their first."""
     groups: dict[Policy, list[Replay]] = {}
     for replay in replays:
         groups.setdefault(replay.recipe.policy, []).append(replay)
@@ -627,7 +639,10 @@ def _by_policy(replays: Iterable[Replay]) -> dict[Policy, list[Replay]]:
 def _tasks(
     contender: Contender, policies: Sequence[Policy], seeds: range, cycles: int
 ) -> list[Task]:
-    """Return the replays of a contender under each policy, for each seed, as tasks."""
+    """Return the replays of a contender under each policy, for each seed, as tasks.
+
+    Policies vary fastest. Each replay shuffles and plays `cycles` parts.
+    """
     players = [
         replace(contender, recipe=replace(contender.recipe, policy=policy)) for policy in policies
     ]
@@ -720,7 +735,10 @@ def _choose(groups: Groups, costs: Costs) -> tuple[list[PolicyCost], PolicyCost,
 
 
 def _chosen_name(row: PolicyCost, verdict: str) -> str:
-    """Return what is chosen: a policy, or to check everything."""
+    """Return what is chosen, as text: the row's policy by name, or "check everything".
+
+    It is the latter if the verdict is "does not pay".
+    """
     return "check everything" if verdict == "does not pay" else policy_name(row.policy)
 
 
@@ -800,7 +818,8 @@ def part_costs(replay: Replay, costs: Costs) -> Floats:
     """Return what each of the n parts of a replay cost, (n,): its check, or its wrong decision.
 
     A right decision without a check costs 0. A part that left an operator's force limits costs as
-    much as a checked one, whether it was verified or rejected.
+    much as a checked one, whether it was verified or rejected. A wrong decision costs no check. The
+    costs are float64, in the unit of `costs`; a decision whose truth is unknown costs 0.
     """
     checked = costs.check * ~(replay.accepted | replay.rejected)
     wrong = costs.escape * replay.false_positive + costs.false_reject * replay.false_negative

@@ -75,7 +75,8 @@ TRUTH_MARKS: dict[Any, tuple[str, Style]] = {
 def blank(width: float, height: float, title: str = "") -> Figure:
     """Return an empty matplotlib figure with a title; width and height are in inches.
 
-    It is made without pyplot, so that no global state keeps it.
+    It is made without pyplot, so that no global state keeps it. It has no axes yet, and a
+    constrained layout.
     """
     from matplotlib.figure import Figure
 
@@ -257,12 +258,15 @@ def window_curves(replays: Sequence[Replay], window: int = WINDOW, fewest: int =
     certain = is_certain.astype(float).rolling(window, min_periods=1).mean()
 
     def count(name: str) -> pd.Series[float]:
-        """Return how many cycles a field marks in each window, over all replays."""
+        """Return how many cycles a field marks in each window, summed over all replays."""
         marks = np.sum([getattr(replay, name) for replay in replays], axis=0)
         return pd.Series(marks).rolling(window, min_periods=1).sum()
 
     def share(wrong: str, decided: str) -> pd.Series[float]:
-        """Return the share of wrong ones of those decided, in the windows of all replays."""
+        """Return the share of wrong ones of those decided, in the windows of all replays.
+
+        It is NaN in a window with fewer than `fewest` of them, or none.
+        """
         n_decided = count(decided)
         return (count(wrong) / n_decided).where(n_decided >= fewest)
 
@@ -281,7 +285,8 @@ def window_curves(replays: Sequence[Replay], window: int = WINDOW, fewest: int =
 def curves(by_recipe: Mapping[str, Sequence[Replay]], title: str = "") -> Figure:
     """Draw the paper's curves over a sliding window of cycles, in a colour for each key.
 
-    A key is a recipe with its replays, or a live run.
+    A key is a recipe with its replays, or a live run. Up to six keys have the
+    colours in `RECIPES`. More keys have 20 others, which the 21st key and those after it use again.
 
     The panels show, from the top: the share of certain decisions, those without a check, and its
     spread over the replays; the share of good parts among the accepted parts, and the policy's
@@ -416,7 +421,10 @@ def _axis_labels(spec: TraceSpec) -> list[str]:
 
 
 def _times(spec: TraceSpec, samples: int) -> tuple[Floats, str]:
-    """Return the time of each sample and the label of that axis; samples if the rate is unknown."""
+    """Return the time of each of so many samples, in seconds from 0, and the label of that axis.
+
+    If the rate is unknown, they are the indices of the samples.
+    """
     label = "time [s]" if spec.rate_hz else "sample"
     return np.arange(samples) / (spec.rate_hz or 1.0), label
 
@@ -467,7 +475,8 @@ def explained_picture(explanation: Explanation) -> Figure:
 def _draw_neighbours(axes: Axes, x: Floats, explanation: Explanation, channel: int) -> None:
     """Draw one channel of the traces of a decision's neighbours, good and bad ones in two styles.
 
-    `x` (T,) are the times of the samples. Neighbours whose trace is not stored are left out.
+    `x` (T,) are the times of the samples. Neighbours whose trace is not stored are left out. The
+    legend counts those that are drawn, of each label.
     """
     for success, name, colour, line, _ in LABEL_STYLES:
         traces = [

@@ -47,7 +47,7 @@ LIBRARIES = ("numpy", "scipy", "torch", "scikit-learn", "umap-learn", "numba", "
 
 @dataclass(frozen=True)
 class Task:
-    """One replay to be played.
+    """One replay to be played; the data set is named beside it.
 
     Parameters
     ----------
@@ -58,6 +58,7 @@ class Task:
     cycles : int or None, default None
         How many; None plays the whole data set.
     shuffle : bool, default True
+        False plays the recorded order.
     """
 
     contender: Contender
@@ -193,7 +194,7 @@ def _digest_of_source() -> str:
 def _source_of(class_or_function: Any) -> str:
     """Return the text of the source file of a class or function; "" if there is no readable file.
 
-    A file is read once in a process.
+    A file is read once in a process, so later changes of it are not seen.
     """
     try:
         return Path(getsourcefile(class_or_function) or "").read_text(encoding="utf-8")
@@ -245,10 +246,10 @@ class PlayedReplay(NamedTuple):
     Attributes
     ----------
     position : int
-        Of its task among the tasks.
+        Of its task among the tasks, from 0.
     replay : Replay
     kept : bool
-        Whether an earlier run had played and kept it.
+        Whether it was read from the folder of finished replays, and not played now.
     """
 
     position: int
@@ -373,16 +374,17 @@ def run_grid(
     repeats : int, default 30
         Shuffles; the seeds count from 0.
     n_jobs : int, default -1
-        Replays at a time, as joblib counts them. Timings are right with 1 alone.
+        Replays at a time, as joblib counts them; -1 is one for each core. Timings are right with 1
+        alone.
     cycles : int or None, default None
         Parts of each replay; None plays all.
     keep : path or None, default None
-        Folder of finished replays, by which an interrupted grid continues.
+        Folder of finished replays, made if it is missing, by which an interrupted grid continues.
 
     Returns
     -------
     frame : DataFrame
-        A row for each replay, see `Replay.summary`.
+        A row for each replay in the order of `grid_tasks`, see `Replay.summary`.
 
     Raises
     ------
@@ -446,9 +448,10 @@ def grid_tasks(
 def play_tasks(
     dataset: Any, tasks: Sequence[Task], *, n_jobs: int = 1, keep: FilePath | None = None
 ) -> list[Replay]:
-    """Play all tasks as `iterate_replays` does; return their replays in the order of the tasks.
+    """Play all tasks like `iterate_replays`; return their replays in the order of the tasks.
 
-    Raises what `iterate_replays` raises.
+    Replays in the folder `keep` are read instead of played, and the others are added to it. Raises
+    what `iterate_replays` raises; then nothing is returned, but finished replays stay in `keep`.
     """
     played = iterate_replays(dataset, tasks, n_jobs=n_jobs, keep=keep)
     replays = {position: replay for position, replay, _ in played}

@@ -61,7 +61,8 @@ def pooled_error(replays: Sequence[Any], side: str = "accepted", alpha: float = 
     Parameters
     ----------
     replays : sequence of Replay
-        All of one data set. None of a live run, which does not record which traces it had.
+        All of one data set; may be empty. None of a live run, which does not record which traces it
+        had.
     side : {"accepted", "rejected"}, default "accepted"
         Which decisions are judged.
     alpha : float, default 0.05
@@ -152,7 +153,10 @@ class Costs:
 
     @property
     def worst_accept(self) -> float:
-        """Largest probability of being bad at which accepting a part pays: check / escape, or 1."""
+        """Largest probability of being bad at which accepting a part pays: check / escape.
+
+        It is 1 if an escape costs nothing, or no more than a check.
+        """
         return min(1.0, self.check / self.escape) if self.escape else 1.0
 
     def saved(
@@ -179,6 +183,7 @@ class Costs:
         """Return the mean cost of a part if the model accepts and rejects these shares of parts.
 
         `bad` is the share of bad parts among the accepted ones, `good` that of good parts among the
-        rejected ones. All other parts are checked. Shares are from 0 to 1.
+        rejected ones. All other parts are checked. Shares are from 0 to 1, and none may be NaN. The
+        result is in the unit of the costs.
         """
         return self.check - self.saved(accepted + rejected, accepted * bad, rejected * good)

@@ -131,8 +131,8 @@ class Contender:
     def with_policy(self, **changes: Any) -> "Contender":
         """Return a copy with other settings of the policy, such as alpha, lower_bound or guarantee.
 
-        Prices may imply a guarantee and audits, as for `Policy.changed`. Raises SettingError for
-        one that is out of range, TypeError for a name that is no setting.
+        Name and baseline stay. Prices may imply a guarantee and audits, as for `Policy.changed`.
+        Raises SettingError for one that is out of range, TypeError for a name that is no setting.
         """
         return replace(self, recipe=self.recipe.with_policy(**changes))
 
@@ -163,7 +163,7 @@ class Replay:
         Whether the part was good: bool in a replay; float in a live run, NaN if the cell does not
         tell.
     lower, upper : array of float, shape (n,)
-        Interval of the success rate.
+        Bounds of the success probability, like those of `Decision`.
     n_success, n_failure : array of int, shape (n,)
         Labels that were counted.
     position : array of float, shape (n, d)
@@ -217,9 +217,11 @@ class Replay:
     seconds: float = float("nan")
 
     def __len__(self) -> int:
+        """Return the number of finished cycles."""
         return len(self.action)
 
     def __repr__(self) -> str:
+        """Return one line: name, policy, cycles, decisions, errors, and dropped retrains if any."""
         counts = self.stretch()
         summary = ", ".join(f"{counts[name]} {name.replace('_', ' ')}" for name in COUNTED[:5])
         cycles = f"{self.recipe.policy.summary}, {len(self)} cycles"
@@ -229,7 +231,7 @@ class Replay:
 
     @property
     def dropped(self) -> list[str]:
-        """Reasons of the retrains that were dropped.
+        """Reasons of the retrains whose version was not put in force, in their order.
 
         A reducer that fails at every retrain leaves a model that is certain of nothing.
         """
@@ -237,7 +239,7 @@ class Replay:
 
     @property
     def verified(self) -> Bools:
-        """The part was checked; (n,) bool."""
+        """The part was checked, for whatever reason: `action` is verify; (n,) bool."""
         return np.asarray(self.action == Action.VERIFY)
 
     @property
@@ -247,7 +249,10 @@ class Replay:
 
     @property
     def rejected(self) -> Bools:
-        """The model rejected the part without a check; (n,) bool."""
+        """The model rejected the part without a check; (n,) bool.
+
+        A part that the operator's force limits rejected does not count.
+        """
         return np.asarray((self.action == Action.REJECT) & ~self.outside)
 
     @property
@@ -267,14 +272,17 @@ class Replay:
 
     @property
     def outside(self) -> Bools:
-        """The trace left an operator's limits: the model was not asked; (n,) bool."""
+        """The trace left the operator's force limits, so the model was not asked; (n,) bool.
+
+        Such a part was verified or rejected.
+        """
         return np.asarray(self.reason == Reason.OUTSIDE)
 
     def to_frame(self) -> "pd.DataFrame":
         """Return a DataFrame with a row for each cycle, numbered from 1.
 
         Its columns are the fields that have a value for each cycle, and one for each dimension of
-        `position`, the embedding: embedding_1, embedding_2, ...
+        `position`, the embedding: embedding_1, embedding_2, ... The index is named "cycle".
         """
         import pandas as pd
 
@@ -293,7 +301,7 @@ class Replay:
         method `stretch` returns them.
 
         A stretch is a number of consecutive cycles. If there are fewer cycles than n, each has a
-        stretch of its own; without cycles the list is empty.
+        stretch of its own, so the list is shorter; without cycles it is empty.
         """
         edges = np.unique(np.linspace(0, len(self), n + 1).round().astype(int)).tolist()
         return [self.stretch(slice(begin, end)) for begin, end in pairwise(edges)]
@@ -416,6 +424,7 @@ def to_replay(observed: Sequence[ObservedCycle], recipe: Recipe) -> Replay:
 
     `recipe` is the recipe of the engine that drove the cell. The fields that only a replay of a
     recorded data set has (`index`, `dataset`, `seed`, `confirm`, `seconds`) keep their defaults.
+    `name` is the recipe's name, and `retrains` has the reports that the cycles carry.
     """
     cycles = [cycle for cycle, _ in observed]
     decisions = [cycle.decision for cycle in cycles]
@@ -583,14 +592,15 @@ def replay_policy(scores: Replay, policy: Policy) -> Replay:
 
     No model is asked. In shadow mode every part was verified, and the counts and embeddings of the
     model were recorded. The rule of the policy decides on these; a rule that only sorts takes the
-    first axis of the embedding, if the reducer predicts a probability there, and no counts. It
-    learns only outcomes that it would know in a replay of its own: checks, audits and line stops,
-    and with `stops="all"` also that an accepted part was good. Two differences to such a replay
-    stay: the predictions come from a model that has learned all labels, and the force limits are
-    those of `scores`; those of `policy` are not applied, since a replay has no traces. Audits are
-    drawn anew, by the seed of the replay. A part for which the model was not asked, such as a novel
-    one or one that left an operator's force limits, is verified; the rule learns its outcome, too,
-    with the bounds 0 and 1.
+    first axis of the embedding, if the reducer predicts a probability there, and no counts. This
+    probability is drawn towards 1/2 while few parts have come (`fade`), if the rule has
+    `prior_labels`. A rule learns only outcomes that it would know in a replay of its own: checks,
+    audits and line stops, and with `stops="all"` also that an accepted part was good. Two
+    differences to such a replay stay: the predictions come from a model that has learned all
+    labels, and the force limits are those of `scores`; those of `policy` are not applied, since a
+    replay has no traces. Audits are drawn anew, by the seed of the replay. A part for which the
+    model was not asked, such as a novel one or one that left an operator's force limits, is
+    verified; the rule learns its outcome, too, with the bounds 0 and 1.
 
     Parameters
     ----------

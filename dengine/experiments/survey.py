@@ -53,8 +53,9 @@ class Survey:
     duplicates : int
         Usable traces that equal an earlier one, by `content_hash`.
     near_repeats, looked_at : int
-        Among the newest `looked_at` usable traces: those that are much nearer to another part's
-        trace than parts are to each other.
+        The first counts, among the newest `looked_at` usable traces, at most 500, those that are
+        much nearer to another part's trace than parts are to each other. It is 0 for fewer than 100
+        traces.
     parts : int or None
         Different parts; None if their numbers are not known.
     """
@@ -131,7 +132,7 @@ def survey_dataset(data: Dataset) -> Survey:
 
 
 def _spread(lengths: Ints | None) -> Spread | None:
-    """Return the smallest, median and largest length; None without lengths."""
+    """Return the smallest, median and largest length (n,), as floats; None if there are none."""
     if lengths is None or not len(lengths):
         return None
     return Spread(*np.quantile(lengths, (0.0, 0.5, 1.0)).tolist())

@@ -60,7 +60,7 @@ def frame_of(replays: Sequence[Replay], check_seconds: float = VERIFY_SECONDS) -
     """Return a table with a row for each replay, as `Replay.summary` gives it.
 
     `check_seconds` is how long a verification takes, for the time saved. Raises SettingError if it
-    is not finite or not above 0.
+    is not finite or not above 0. Without replays the table has no rows and no columns.
     """
     import pandas as pd
 
@@ -120,7 +120,7 @@ def pool(frame: pd.DataFrame, replays: Sequence[Replay]) -> list[Row]:
 
 
 def _share_right(n_wrong: int, n_decided: int) -> float:
-    """Return the share of right decisions, NaN without any."""
+    """Return the share of right decisions, from 0 to 1; NaN if nothing was decided."""
     return 1.0 - n_wrong / n_decided if n_decided else math.nan
 
 
@@ -209,12 +209,15 @@ def table_of_numbers(
 
 
 def _whole(value: float) -> str:
-    """Return a number without decimals, "-" for NaN."""
+    """Return a number as text, rounded to an integer; "-" for NaN."""
     return "-" if math.isnan(value) else f"{value:.0f}"
 
 
 def _with_sd(row: Row, name: str) -> str:
-    """Return a mean ± its standard deviation, the mean alone if there is one replay."""
+    """Return the mean `name` of a pooled row as text, ± its standard deviation over the replays.
+
+    Both are rounded to integers. For one replay it is the mean alone, with one decimal.
+    """
     deviation = row[f"{name}_sd"]
     return f"{row[name]:.1f}" if math.isnan(deviation) else f"{row[name]:.0f}±{deviation:.0f}"
 
@@ -256,6 +259,8 @@ def retrain_line(retrains: Sequence[RetrainReport]) -> str:
 
 def write_csv(frame: pd.DataFrame, path: str | Path, force: bool = False) -> Path:
     """Write a frame as CSV without its index, creating the folder; return the file's path.
+
+    The text is UTF-8, with a header and line feeds. The file is written as a whole or not at all.
 
     Raises
     ------

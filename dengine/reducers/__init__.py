@@ -85,8 +85,8 @@ def make_reducer(name: str, **params: Any) -> Any:
     **params
         Parameters of its class. For a name in `REDUCERS` the type of each value must fit the
         parameter's default, so `random_state` must be an integer; integers must fit into 32 bits
-        (`folds`: from 2 to 1000), and a number must not be NaN. A parameter whose default is None
-        is not checked. `fit` checks narrower ranges.
+        (`folds`: from 2 to 1000), and a number must not be NaN. A parameter whose default is None,
+        and those of `module:Class`, are not checked. `fit` checks narrower ranges.
 
     Returns
     -------
@@ -132,6 +132,8 @@ def _check_parameter(default: Any, key: str, value: Any) -> None:
 def class_default(reducer: Any, name: str) -> Any:
     """Return an attribute of a reducer's class, such as `default_radius`; see `Reducer`.
 
+    The class of a reducer given by name is imported.
+
     Parameters
     ----------
     reducer : str, type or estimator
@@ -142,8 +144,8 @@ def class_default(reducer: Any, name: str) -> Any:
     Returns
     -------
     object
-        The value of `Reducer` if the class has no such attribute, because it is another
-        scikit-learn transformer.
+        Of an object its own attribute. The value of `Reducer` if the class has no such attribute,
+        because it is another scikit-learn transformer.
 
     Raises
     ------
@@ -157,8 +159,9 @@ def class_default(reducer: Any, name: str) -> Any:
 def has_own_unit(reducer: Any) -> bool:
     """Return whether the embedding of a reducer is never scaled, see `Reducer.own_unit`.
 
-    Its first axis is then a predicted probability. `reducer` is a name, a class or an object.
-    Raises SettingError for an unknown name.
+    Of the reducers of dengine, the first axis is then a predicted probability. `reducer` is a name
+    or `module:Class`, whose class is imported, a class or an object. False for a transformer that
+    is no `Reducer`. Raises SettingError like `reducer_class`.
     """
     return bool(class_default(reducer, "own_unit"))
 

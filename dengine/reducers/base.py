@@ -58,8 +58,8 @@ class StopRule:
         Value of `clock` after which no further step begins. None: no deadline, so that a fit
         repeats exactly for a seed.
     max_steps : int, optional
-        Largest number of steps.
-    clock : callable
+        Largest number of steps. None: no limit.
+    clock : callable, default `time.perf_counter`
         Returns the present time in seconds.
     late : bool
         Whether the deadline, and not the number of steps, ended the fit.
@@ -101,7 +101,7 @@ class FitReport:
     n_steps : int
         Optimiser steps that it took.
     note : str
-        One line for the operator.
+        One line for the operator; "" if there is nothing to say.
     n_steps_left : int
         Steps that are missing until training is complete. If there are some, an engine without a
         product retrains again without waiting for new labels.
@@ -117,19 +117,19 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
 
     Attributes
     ----------
-    uses_labels : bool
+    uses_labels : bool, default False
         Whether `fit` reads `y`. A reducer that does, and has a single space, is cross-fitted by
         `as_reducer`.
-    scores : bool
+    scores : bool, default False
         Whether the first coordinate is the predicted probability of success.
-    own_unit : bool
+    own_unit : bool, default False
         Whether the embedding has a unit, a probability for example. It is then not scaled.
-    min_traces : int
+    min_traces : int, default 1
         Number of labelled traces that an engine collects before the first training.
-    default_radius : float
+    default_radius : float, default 0.3
         Radius of the neighbourhood whose labels count, if a recipe names none. Unless `own_unit`
         is True, the embedding is first scaled to a root mean square radius of 1.
-    default_retrain_every : int
+    default_retrain_every : int, default 50
         New labels between two retrains, if a recipe names none.
     why_no_module_ : str or None
         Why `module` returns None, for the error of an export; None if that is not known yet.
@@ -156,6 +156,10 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
             Traces.
         y : array, shape (n,), optional
             Labels of two classes; the one that sorts last is success. Only read if `uses_labels`.
+
+        Returns
+        -------
+        self
         """
 
     def transform(self, X: ArrayLike) -> Floats:
@@ -189,7 +193,7 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
 
     @property
     def n_spaces(self) -> int:
-        """Return K, the number of embedding spaces."""
+        """Return K, the number of embedding spaces; 1 by default. It is known before a fit."""
         return 1
 
     def train(
@@ -231,9 +235,9 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
     def untrained_module(self, X: Floats) -> Any:
         """Return a module like the one that `module` returns after training on X (n, C, T).
 
-        Its attribute `dim` is the number of coordinates. None, the default, if the module is not
-        known before training. The engine compiles this module ahead of the first training, which
-        then has less to do.
+        Its attribute `dim` is the number of coordinates; its weights do not matter. None, the
+        default, if the module is not known before training. X is only read. The engine compiles
+        this module ahead of the first training, which then has less to do.
         """
 
     def warm_up(self) -> None:  # a default: nothing to load
@@ -253,7 +257,7 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
         """Embed traces (n, C, T) in every space; return float32 (n, K, d).
 
         Space k is fitted without the labels of fold k. By default there is one space, in which a
-        trace lies where `transform` puts it.
+        trace lies where `transform` puts it; it raises what `transform` raises.
         """
         return as_points(self.transform(X))[:, None, :]
 
@@ -274,7 +278,8 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
     def get_state(self) -> State | None:
         """Return arrays from which `set_state` restores the reducer bit for bit.
 
-        None, the default, if the reducer can only be restored by fitting it again.
+        None, the default, if the reducer can only be restored by fitting it again. The
+        constructor's parameters are not among them.
         """
         return None
 
@@ -300,7 +305,7 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
 
     @property
     def report(self) -> FitReport:
-        """Return the report of the last fit; by default an empty one."""
+        """Return the report of the last fit; by default one with 0 steps and no note."""
         return FitReport()
 
     def check_traces(self, X: Any, *, reset: bool = False) -> Floats:
@@ -375,11 +380,14 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
 
     @property
     def _n_features_out(self) -> int:  # scikit-learn's name, for get_feature_names_out
+        """Return d, by embedding a trace of zeros; NotFittedError before a fit."""
         check_is_fitted(self)
         return int(self.transform(np.zeros((1, *self.trace_shape_))).shape[1])
 
     def __sklearn_tags__(self) -> Any:
-        """Return scikit-learn's tags: labels of two classes are needed if `uses_labels`."""
+        """Return scikit-learn's tags: labels of two classes are needed if `uses_labels`, and the
+        output is float32.
+        """
         tags = super().__sklearn_tags__()
         tags.target_tags.required = self.uses_labels
         if self.uses_labels:
@@ -391,7 +399,7 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
 
 
 def as_points(Z: Any) -> Floats:
-    """Return an embedding (n, d) as a contiguous float32 array."""
+    """Return an embedding (n, d) as a contiguous float32 array; the same array if it is one."""
     return np.ascontiguousarray(Z, dtype=np.float32)
 
 
@@ -403,14 +411,18 @@ def as_rows(traces: Floats) -> Floats:
 
 @torch.inference_mode()
 def embed_in_chunks(module: Callable[[Tensor], Tensor], x: Tensor, size: int) -> Floats:
-    """Embed the rows of x (n, ...) by a module, `size` rows at a time: float32 (n, K, d)."""
+    """Embed the rows of x (n, ...) by a module, `size` rows at a time: float32 (n, K, d).
+
+    No gradients are kept, and n may be 0. The module is called in the mode that it is in.
+    """
     return torch.cat([module(chunk) for chunk in torch.split(x, size)]).numpy()
 
 
 def points_in_fold_space(Z: Floats, folds: Ints) -> Floats:
     """Return the points (n, d) of an embedding (n, K, d): point i in space ``folds[i]``.
 
-    If there is a single space, all points are in it.
+    If there is a single space, all points are in it, and `folds` is not read. The result is a
+    contiguous copy.
     """
     spaces = np.asarray(folds) if Z.shape[1] > 1 else np.zeros(len(Z), dtype=np.int64)
     return np.ascontiguousarray(Z[np.arange(len(Z)), spaces])
@@ -508,7 +520,8 @@ def folds_of(traces: Floats, n_folds: int, folds: Any = None) -> Ints:
     """Return the folds of traces (n, C, T), int64 (n,): those given, or by a hash of each trace.
 
     Given folds are cast to int64. Raises SettingError unless there is one for each trace, and each
-    lies between 0 and n_folds - 1; what NumPy raises for folds that are no numbers.
+    is one of 0 to n_folds - 1; what NumPy raises for folds that are no numbers. A fold may have no
+    trace.
     """
     if folds is None:
         return content_fold(traces, n_folds)
@@ -522,8 +535,9 @@ def check_classes(labels: Ints, masks: NDArray[np.bool_]) -> None:
     """Raise SettingError unless, for each fold, the labels (n,) outside it have both classes.
 
     Row k of `masks`, bool (K, n), tells which labels are outside fold k. The message asks for more
-    labels. If no label is outside a fold, it says instead that all traces are the same, which puts
-    them into one fold, and asks to check the sensor and the unit of measurement.
+    labels, and names the first such fold. If no label is outside a fold, it says instead that all
+    traces are the same, which puts them into one fold, and asks to check the sensor and the unit of
+    measurement.
     """
     for fold, outside in enumerate(masks):
         n_classes = len(np.unique(labels[outside]))
@@ -555,7 +569,8 @@ def draw_seed(random_state: Any) -> int:
 def check_integers(reducer: Any, **ranges: tuple[int, int]) -> None:
     """Raise SettingError unless each of these parameters is an integer in its range.
 
-    A range holds the smallest and the largest value.
+    Each parameter is an attribute of `reducer`. A range holds the smallest and the largest value,
+    both allowed. True, False and floats are no integers.
     """
     for name, (least, most) in ranges.items():
         value = getattr(reducer, name)
@@ -563,7 +578,10 @@ def check_integers(reducer: Any, **ranges: tuple[int, int]) -> None:
 
 
 def uses_labels(transformer: Any) -> bool:
-    """Return whether a transformer's `fit` needs labels, by its tag `target_tags.required`."""
+    """Return whether a transformer's `fit` needs labels, by its tag `target_tags.required`.
+
+    It may be fitted or not. Raises AttributeError for an object without scikit-learn's tags.
+    """
     return bool(get_tags(transformer).target_tags.required)
 
 
@@ -573,8 +591,9 @@ def as_reducer(transformer: Any, folds: int) -> Reducer:
     A `Reducer` that has several embedding spaces, or uses no labels, is returned as it is. Another
     transformer whose tag says that it needs labels (`uses_labels`) is wrapped in `CrossFitted`,
     which fits `folds` clones. A transformer without that tag is wrapped in `LabelFree` and never
-    gets labels, so its single space has seen none. Nothing is fitted here. Raises AttributeError
-    for a transformer without scikit-learn's tags, which `BaseEstimator` has.
+    gets labels, so its single space has seen none. The wrapper holds the transformer itself and
+    fits clones of it. Nothing is fitted here. Raises AttributeError for a transformer without
+    scikit-learn's tags, which `BaseEstimator` has.
     """
     if isinstance(transformer, Reducer) and (
         transformer.n_spaces > 1 or not transformer.uses_labels
@@ -624,6 +643,10 @@ class LabelFree(_Wrapping):
         return self
 
     def transform(self, X: ArrayLike) -> Floats:
+        """Embed traces (n, T) or (n, C, T) by `reducer_`, all in one call: float32 (n, d).
+
+        Raises what `check_traces` and the transformer raise.
+        """
         inputs = self.as_input(self.check_traces(X))
         return as_points(self.reducer_.transform(inputs))
 
@@ -646,6 +669,7 @@ class CrossFitted(_Wrapping):
 
     @property
     def n_spaces(self) -> int:
+        """Return K, the parameter `folds`; it is known before a fit."""
         return int(self.folds)
 
     def fit(self, X: ArrayLike, y: ArrayLike | None = None, *, folds: Ints | None = None) -> Self:
@@ -689,8 +713,17 @@ class CrossFitted(_Wrapping):
         return self
 
     def train(self, X: Floats, y: Ints, folds: Ints, *_: object, **__: object) -> Floats:
+        """Fit all clones anew, by the given folds, and return the points, float32 (n, d).
+
+        Row i lies in space ``folds[i]``. `stop` and `numbers` have no effect. Raises what `fit`
+        raises.
+        """
         return self.fit(X, y, folds=folds).embed_references(X, folds)
 
     def embed(self, X: Floats) -> Floats:
+        """Embed traces (n, T) or (n, C, T) by each clone: float32 (n, K, d), space k by clone k.
+
+        Each clone gets all traces in one call. Raises what `check_traces` and the clones raise.
+        """
         inputs = self.as_input(self.check_traces(X))
         return np.stack([as_points(fitted.transform(inputs)) for fitted in self.clones_], axis=1)

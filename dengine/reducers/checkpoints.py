@@ -39,8 +39,8 @@ def load_checkpoint(members: Members, path: str | Path) -> None:
     Raises
     ------
     SettingError
-        If the file cannot be read, has other names or shapes than the network, or has values that
-        are not finite. `members` is then unchanged.
+        If the file cannot be read, holds anything but dense tensors, has other names or shapes than
+        the network, or has values that are not finite. `members` is then unchanged.
     """
     weights = read_tensors(path)
     state = members.state_dict()
@@ -62,8 +62,9 @@ def load_checkpoint(members: Members, path: str | Path) -> None:
 def read_tensors(path: str | Path) -> dict[str, Tensor]:
     """Return the dict of tensors that `torch.save` wrote to a file, without running code of it.
 
-    Raises SettingError if the file cannot be read, or holds anything but a dict of dense tensors of
-    types that NumPy has.
+    The tensors are on the CPU, need no gradient, and have their names as keys. Raises SettingError
+    if the file cannot be read, or holds anything but a dict of dense tensors of types that NumPy
+    has.
     """
     with instead(SettingError, f"The checkpoint {path} cannot be read", OSError):
         content = Path(path).read_bytes()
@@ -79,7 +80,12 @@ def read_tensors(path: str | Path) -> dict[str, Tensor]:
 
 
 def shape_of_member(name: str, value: Tensor, count: int) -> torch.Size:
-    """Return the shape that a tensor of a `Members` of `count` copies has in a checkpoint."""
+    """Return the shape that a tensor of a `Members` of `count` copies has in a checkpoint.
+
+    A checkpoint holds one copy. `name` is the tensor's name in the `state_dict`. The copies lie
+    along the first axis, whose length is therefore divided by `count`. A tensor without axes, and
+    one of a network that is a module of its own (`Separate`), keep their shape.
+    """
     if value.dim() == 0 or SEPARATE.match(name):
         return value.shape
     return torch.Size([value.shape[0] // count, *value.shape[1:]])

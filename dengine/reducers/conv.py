@@ -165,6 +165,7 @@ def average_logits(
     Returns
     -------
     Tensor of float32, shape (..., dim)
+        A new tensor. The other coordinates are those of `points`.
     """
     logits = 0.5 * (points.narrow(-1, 0, 1).logit(smallest) + probabilities.logit(smallest))
     return torch.cat([logits.sigmoid(), points.narrow(-1, 1, points.size(-1) - 1)], -1)
@@ -206,6 +207,7 @@ class ConvReducer(TorchReducer):
             self.rocket_.raw_features(traces, numbers)
 
     def _initialize(self, traces: Floats) -> None:
+        """Do what `TorchReducer._initialize` does, and draw the kernels of a new `rocket_`."""
         super()._initialize(traces)
         self.rocket_._initialize(traces)
 
@@ -258,10 +260,20 @@ class ConvReducer(TorchReducer):
         return average_logits(points, torch.from_numpy(self.rocket_.embed(traces))).numpy()
 
     def module(self) -> ConvEncoder:
+        """Return a new module that embeds, (B, C, T) -> (B, K, d), in evaluation mode.
+
+        It is never None. It shares its tensors with the reducer: later trainings change the half of
+        `rocket_` in place, but not the network's. Raises NotFittedError before a fit.
+        """
         check_is_fitted(self, "encoder_")
         return ConvEncoder(self.encoder_, self.rocket_.module()).eval()
 
     def get_state(self) -> State:
+        """Return the arrays of `TorchReducer.get_state`, and those of `rocket_`.
+
+        The names of the latter begin with "rocket.". `set_state` restores the reducer from them bit
+        for bit. Raises NotFittedError before a fit, AttributeError before the first training.
+        """
         rocket = {f"rocket.{name}": value for name, value in self.rocket_.get_state().items()}
         return super().get_state() | rocket
 

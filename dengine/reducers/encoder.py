@@ -96,12 +96,15 @@ class Members(nn.Module):
         return units.sigmoid()
 
     def logits(self, units: Tensor) -> Tensor:
-        """Units (B, K, 2) -> logits (B, K)."""
+        """Units (B, K, 2) -> logits (B, K): the units times `slope`, summed, plus `offset`."""
         return (units * self.slope).sum(2) + self.offset
 
 
 class Grouped(nn.Module):
-    """Compute all copies of a network by one module, `network`: (B, K, C', L) -> (B, K, F)."""
+    """Compute all copies of a network by one module, `network`: (B, K, C', L) -> (B, K, F).
+
+    The module reads all copies' channels one after another, (B, K * C', L), and gives (B, K * F).
+    """
 
     def __init__(self, network: NetworkFactory, channels: int, samples: int, count: int) -> None:
         super().__init__()
@@ -114,7 +117,10 @@ class Grouped(nn.Module):
 
 
 class Separate(nn.Module):
-    """Compute each copy of a network by a module of its own: (B, K, C', L) -> (B, K, F)."""
+    """Compute each copy of a network by a module of its own: (B, K, C', L) -> (B, K, F).
+
+    Module k of `networks` maps the traces of copy k, (B, C', L), to its features (B, F).
+    """
 
     def __init__(self, networks: list[nn.Module]) -> None:
         super().__init__()

@@ -78,13 +78,20 @@ class RidgeProblem:
         return cls(g32, g32.double(), y.double(), outside.double(), ridge)
 
     def objective(self, w: Tensor) -> Tensor:
-        """Compute the sum of log losses plus the ridge of heads (K, W + 1): (K,)."""
+        """Compute the objective of heads w (K, W + 1), in nats: (K,).
+
+        It is the sum of log losses over the rows that train the head, plus half the ridge times the
+        square of each weight.
+        """
         logits = w @ self.g.T
         losses = summed_loss(logits, self.y, self.mask)
         return losses + 0.5 * (self.ridge * w * w).sum(1)
 
     def gradient(self, w: Tensor, p: Tensor) -> Tensor:
-        """Compute the gradient of the objective at heads that predict p (K, n): (K, W + 1)."""
+        """Compute the gradient of `objective` at heads w (K, W + 1): (K, W + 1).
+
+        `p` (K, n) are the probabilities that these heads give; they are not computed here.
+        """
         return (self.mask * (p - self.y)) @ self.g + self.ridge * w
 
     def cholesky_of_hessian(self, k: int, p: Tensor) -> Tensor:
@@ -115,8 +122,9 @@ def fit_heads(
     Head k, trained without the labels of fold k, minimises the sum of its log losses plus ``l2 / 2
     * |w| ** 2``; the ridge of the bias is nearly 0. This is convex, so a head ends at the same
     weights wherever it starts, unless the steps are limited. A step that raises the loss of a head,
-    ridge included, is halved; if six sizes raise it, the step is left out. A head has converged
-    when its next step would change no weight by more than about 0.0002. The factor of its Hessian
+    ridge included, is halved; if six sizes raise it, the step is left out, and the head ends unless
+    its Hessian was an old one. A head has converged when its next step would change no weight by
+    more than about 0.0002. The factor of its Hessian
     is used again after a step whose largest change is at most a quarter of that of the step before,
     and at most 0.3. If the leave-one-out loss of a head is above the loss of its base rate, the
     share of successes among its rows, the head is replaced by the base rate. This is decided for
@@ -262,5 +270,9 @@ def masked_loss(logits: Tensor, y: Tensor, mask: Tensor) -> Tensor:
 
 
 def summed_loss(logits: Tensor, y: Tensor, mask: Tensor) -> Tensor:
-    """Sum log losses over the rows that each mask selects; arguments as in `masked_loss`."""
+    """Sum log losses, in nats, over the rows that each mask selects; 0 for a mask without rows.
+
+    The arguments are those of `masked_loss`: logits (..., K, n), labels y (n,), mask (K, n) of 1
+    and 0. Returns (..., K).
+    """
     return (mask * (F.softplus(logits) - y * logits)).sum(-1)

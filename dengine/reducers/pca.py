@@ -77,10 +77,15 @@ class PcaReducer(Reducer):
         return self
 
     def embed(self, X: Floats) -> Floats:
+        """Project traces (n, T) or (n, C, T) on the principal axes: float32 (n, 1, n_components).
+
+        The mean of the fit is subtracted first. Raises the errors of `check_traces`.
+        """
         centred = as_rows(self.check_traces(X)) - self.mean_
         return np.asarray(centred @ self.components_.T)[:, None, :]
 
     def module(self) -> nn.Module:
+        """Return a new `PcaEncoder` with the fitted mean and axes; NotFittedError before `fit`."""
         check_is_fitted(self, "components_")
         return PcaEncoder(torch.from_numpy(self.mean_), torch.from_numpy(self.components_))
 
@@ -112,7 +117,8 @@ class PcaReducer(Reducer):
 class PcaEncoder(nn.Module):
     """Project raw traces on principal axes: (B, C, T) -> (B, 1, n_components).
 
-    mean (C * T,), components (n_components, C * T).
+    mean (C * T,) is subtracted first; components (n_components, C * T) are the axes. Both are
+    float32 tensors, of traces whose channels stand one after another.
     """
 
     mean: Tensor
@@ -124,5 +130,5 @@ class PcaEncoder(nn.Module):
         self.register_buffer("components", components.T.contiguous())
 
     def forward(self, x: Tensor) -> Tensor:
-        """Raw traces (B, C, T) -> (B, 1, n_components)."""
+        """Raw traces (B, C, T), less the mean, on the axes -> (B, 1, n_components)."""
         return ((x.flatten(1) - self.mean) @ self.components).unsqueeze(1)

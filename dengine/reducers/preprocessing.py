@@ -72,11 +72,19 @@ class Preprocessor(nn.Module):
         return torch.stack([x, F.pad(differences, [1, 0])], 2).flatten(1, 2)
 
     def average_samples(self, x: Tensor) -> Tensor:
-        """Raw traces (B, C, T) -> averaged (B, C, L); no sample is standardised yet."""
+        """Raw traces (B, C, T) -> averaged (B, C, L); no sample is standardised yet.
+
+        If T is no multiple of `average`, the first samples are left out. If `average` is 1, x
+        itself is returned.
+        """
         return F.avg_pool1d(x[:, :, self.skipped :], self.average) if self.average > 1 else x
 
     def standardise(self, x: Tensor) -> Tensor:
-        """Averaged traces (B, C, L) -> standardised and clipped (B, C, L)."""
+        """Averaged traces x (B, C, L) -> standardised and clipped (B, C, L).
+
+        The values of each channel are (x - mean) * scale, clipped at ±8. Before `learn` the mean is
+        0 and the scale 1.
+        """
         return ((x - self.mean) * self.scale).clamp(-self.clip, self.clip)
 
 

@@ -50,6 +50,7 @@ class ProbabilityReducer(Reducer):
 
     @property
     def n_spaces(self) -> int:
+        """Return K, the parameter `folds`; it is known before a fit."""
         return int(self.folds)
 
     def fit(self, X: ArrayLike, y: ArrayLike | None = None, *, folds: Ints | None = None) -> Self:

@@ -127,7 +127,11 @@ class FeatureEmbedding(nn.Module):
 
 
 def pairwise_products(g: Tensor) -> Tensor:
-    """Multiply every column with every column: (n, m) -> (n, m * m)."""
+    """Multiply every column with every column: (n, m) -> (n, m * m).
+
+    Column ``i * m + j`` of the result is column i times column j, so i = j gives squares, and each
+    other product comes twice.
+    """
     return (g.unsqueeze(2) * g.unsqueeze(1)).flatten(1)
 
 
@@ -190,7 +194,7 @@ class Tower(NamedTuple):
         return cls(scaled_axes, -(f.mean(0) @ scaled_axes), w)
 
     def components(self, f: Tensor) -> Tensor:
-        """Features (n, p) -> components (n, W)."""
+        """Scaled features (n, p) of this tower -> components (n, W): f @ axes + centre."""
         return torch.addmm(self.centre, f, self.axes)
 
     def heads(self) -> tuple[Tensor, Tensor]:
@@ -280,7 +284,7 @@ class RocketReducer(ProbabilityReducer):
     Attributes
     ----------
     n_iter_ : int
-        Steps of the last fit.
+        Newton steps of the last fit, of the tower that took most.
     holdout_losses_ : array of float64, shape (K,)
         Leave-one-out log loss of the logit of each space, over the rows outside its fold.
 
@@ -301,6 +305,10 @@ class RocketReducer(ProbabilityReducer):
     max_iter: int = 20
 
     def _fit(self, traces: Floats, labels: Ints, folds: Ints) -> None:
+        """Fit the heads on checked traces (n, C, T) without a deadline; see `train_heads`.
+
+        Raises SettingError if the traces outside a fold have a single class.
+        """
         check_classes(labels, self.training_masks(folds))
         self.train_heads(traces, labels, folds, StopRule())
 
@@ -458,7 +466,10 @@ class RocketReducer(ProbabilityReducer):
         return [*features, pairwise_products(leading)]
 
     def training_masks(self, folds: Ints) -> NDArray[np.bool_]:
-        """Return masks (K, n): row k selects the traces outside fold k, which train head k."""
+        """Return bool masks (K, n): row k selects the traces outside fold k, which train head k.
+
+        `folds` (n,) are the folds of the traces; K is the parameter `folds`.
+        """
         return np.asarray(folds != np.arange(self.folds)[:, None])
 
     def _compute_components(self, raw: Tensor) -> None:
@@ -565,10 +576,15 @@ class RocketReducer(ProbabilityReducer):
         return embed_in_chunks(self.net_, torch.from_numpy(self.check_traces(X)), CHUNK)
 
     def _embed_raw(self, raw: Tensor) -> Tensor:
-        """Raw features (n, P) -> (n, K, d)."""
+        """Unscaled features (n, P) -> points of their traces in every space (n, K, d)."""
         return self.net_.embed_features(self.net_.encoder.scale_features(raw))
 
     def module(self) -> FeatureEmbedding:
+        """Return the module `net_` itself, (B, C, T) -> (B, K, d), which later trainings change.
+
+        A new `fit`, or a restored state, makes another one. It is in evaluation mode. Raises
+        NotFittedError before there are kernels.
+        """
         check_is_fitted(self, "net_")
         return self.net_
 
@@ -633,9 +649,10 @@ class RocketReducer(ProbabilityReducer):
 
 
 def sample_rows(n: int, numbers: Ints | None) -> Ints | slice:
-    """Draw `MAX_TRAINING_TRACES` of n rows, without reading labels; return them in order.
+    """Draw `MAX_TRAINING_TRACES`, 4000, of n rows, without reading labels; return them in order.
 
-    If there are no more rows than that, all are returned, as a slice.
+    They are int64 (4000,), increasing. If there are no more rows than that, the result is instead
+    ``slice(None)``, which selects all. The same arguments give the same rows.
 
     A hash of the labels' numbers (n,) draws them, evenly in time. So most rows are those of the
     last fit, and the heads start near their final weights. If `numbers` is None, they are 0 to

@@ -65,7 +65,16 @@ class RocketEncoder(nn.Module):
     Attributes
     ----------
     towers : list of slice
-        Columns of each tower among the P features.
+        Columns of each tower among the P features; one slice if `groups` is 0.
+
+    Raises
+    ------
+    SettingError
+        For fewer than 2 samples.
+
+    Notes
+    -----
+    All kernels are 0 until `learn` draws them, or until a state is restored.
     """
 
     shift: Tensor
@@ -144,7 +153,7 @@ class RocketEncoder(nn.Module):
             self.register_buffer(name, value, persistent=False)
 
     def forward(self, x: Tensor) -> Tensor:
-        """(B, C, T) raw traces -> (B, P) scaled features."""
+        """Raw traces (B, C, T) -> standardised, clipped features (B, P)."""
         return self.scale_features(self.raw_features(x))
 
     def raw_features(self, x: Tensor) -> Tensor:
@@ -167,7 +176,11 @@ class RocketEncoder(nn.Module):
         return torch.cat([ramps, self.competition_features(sparse, batch)], 1)
 
     def scale_features(self, raw: Tensor) -> Tensor:
-        """Standardise raw features (B, P) and clip them at 4 deviations: (B, P)."""
+        """Standardise unscaled features (B, P) and clip them at ±4 deviations: a new tensor (B, P).
+
+        Each becomes `offset` + `gain` times the feature; before `learn_feature_scales` these are 0
+        and 1. `raw` is not changed.
+        """
         scaled = torch.addcmul(self.offset, raw, self.gain)
         return scaled.clamp_(-self.feature_clip, self.feature_clip)
 
@@ -331,8 +344,9 @@ class RocketEncoder(nn.Module):
 def compute_raw_features(encoder: RocketEncoder, traces: Floats) -> Tensor:
     """Compute the unscaled features of traces (n, C, T): float32 (n, P).
 
-    The encoder computes 32 traces at a time. The features of a trace are the same to the bit
-    whatever other traces it comes with, since the last 32 are filled up with traces of zeros.
+    Gradients are not switched off here. The encoder computes 32 traces at a time. The features of a
+    trace are the same to the bit whatever other traces it comes with, since the last 32 are filled
+    up with traces of zeros.
     """
     features = []
     for chunk in torch.split(torch.from_numpy(traces), CHUNK):
@@ -353,9 +367,10 @@ def rocket_kernels() -> Tensor:
 def tap_positions(frames: int, dilations: int, places: int) -> NDArray[np.int64]:
     """Return the frame that each tap of a kernel reads, int64 (D, 9, P), for P places in a trace.
 
-    A tap is one of the nine inputs of a kernel. The dilations are spaced evenly in their logarithm,
-    from 1 to that at which a kernel spans the trace. `dilations` is the largest D; D is smaller for
-    short traces. For a tap beyond the ends of the trace the position is
+    A tap is one of the nine inputs of a kernel. The places are spaced evenly over the trace, and a
+    kernel reads four inputs on each side of its place, a dilation apart. The dilations are spaced
+    evenly in their logarithm, from 1 to that at which a kernel spans the trace. `dilations` is the
+    largest D; D is smaller for short traces. For a tap beyond the ends of the trace the position is
     ``2 * frames - 1``, at which `RocketEncoder.read_taps` finds a zero.
     """
     widest = np.log2((frames - 1) / (TAPS - 1)) if frames > TAPS else 0.0  # spans the trace

@@ -90,7 +90,12 @@ class Augmentation:
     mixup: float
 
     def __call__(self, x: Tensor, y: Tensor, rng: np.random.Generator) -> tuple[Tensor, Tensor]:
-        """Augment a batch; a trace is mixed with another trace of the same copy of the network.
+        """Augment a batch: shift, scale, add noise, mix; return new tensors.
+
+        A shifted trace repeats its end frame. A trace is mixed with the one before it in the batch,
+        of the same copy of the network; its own share is at least a half. If `mixup` is 0, nothing
+        is mixed, and `y` itself is returned. Shift, factor and share are drawn for each trace and
+        copy.
 
         Parameters
         ----------
@@ -142,16 +147,18 @@ class TorchReducer(ProbabilityReducer):
         K, the number of folds, and so of copies of the network and of spaces. Copy k is trained
         without the labels of fold k.
     steps : int, default 12
-        AdamW steps of a retrain; twice as many while training is behind (see `n_steps_left_`).
+        AdamW steps of a retrain; up to twice as many while training is behind (see
+        `n_steps_left_`).
     fit_steps : int, default 400
-        Steps of `fit`, and of the training after many labels came at once; twice as many hardly
-        lower the loss.
+        Steps of `fit`, and the steps of all retrains together after which training is complete,
+        however many labels there are; twice as many hardly lower the loss.
     batch_size : int, default 32
         Traces in a step, for each copy of the network.
     learning_rate, weight_decay : float, default 4e-3, 0.02
         Of AdamW. The rate is constant, since training never ends.
     weight_averaging : float, default 0.97
         Share of the averaged weights that remains in a step; the rest comes from the new weights.
+        In the first steps it is smaller.
     shift, gain, noise, mixup : default 5, 0.05, 0.03, 0.1
         Augmentation: frames of shift in time, standard deviations of a factor and of white noise,
         and the parameter of mixup; 0 turns each off.
@@ -200,12 +207,12 @@ class TorchReducer(ProbabilityReducer):
         """Train on traces (n, C, T), labels y (n,) 1 or 0, and folds (n,); replace `encoder_`.
 
         It takes `n_steps_due` steps, or fewer if `stop` ends them, and starts from the weights of
-        the last training, or from initial weights the first time. `numbers` is not read, and folds
-        are not checked. Augmentation and randomness are those of `fit_loop`. Returns the points of
-        the traces, float32 (n, d), row i in embedding space ``folds[i]``. Raises the errors of
-        `check_traces`, and SettingError for fewer than two traces outside a fold, and at the first
-        training for fewer than 20 traces, or a parameter, network or checkpoint that cannot be
-        used.
+        the last training, or from initial weights the first time. `numbers` is only read by
+        `ConvReducer`, and folds are not checked. Augmentation and randomness are those of
+        `fit_loop`. Returns the points of the traces, float32 (n, d), row i in embedding space
+        ``folds[i]``. Raises the errors of `check_traces`, and SettingError for fewer than two
+        traces outside a fold, and at the first training for fewer than 20 traces, or a parameter,
+        network or checkpoint that cannot be used.
         """
         traces = self._check_and_initialize(X)
         steps = self.n_steps_due(len(traces))
@@ -276,6 +283,7 @@ class TorchReducer(ProbabilityReducer):
         self.loss_ = float("nan")
 
     def _fit(self, traces: Floats, labels: Ints, folds: Ints) -> None:
+        """Take `fit_steps` steps on checked traces (n, C, T), without a deadline; see `_train`."""
         self._train(traces, labels, folds, StopRule(), self.fit_steps)
 
     def _train(
@@ -433,8 +441,8 @@ class TorchReducer(ProbabilityReducer):
     def _embed_in_fold_space(self, x: Tensor, folds: Ints) -> Floats:
         """Embed preprocessed traces (n, C', L), each in one embedding space: float32 (n, d).
 
-        Row i is in space ``folds[i]``, as a reference. Network k computes the rows of fold k alone,
-        so this takes 1 / K of the time of `embed`.
+        Row i is in space ``folds[i]``, as a reference; folds must be 0 to K - 1. Network k computes
+        the rows of fold k alone, so this takes 1 / K of the time of `embed`.
         """
         rows_of_fold = [torch.from_numpy(np.flatnonzero(folds == k)) for k in range(self.folds)]
         points = torch.empty(len(x), self.n_components)
@@ -455,6 +463,7 @@ class TorchReducer(ProbabilityReducer):
         return embed_in_chunks(self.encoder_, torch.from_numpy(self.check_traces(X)), CHUNK)
 
     def warm_up(self) -> None:
+        """Import what AdamW's first step needs, once in a process; see `warm_optimizer`."""
         warm_optimizer()
 
     def module(self) -> nn.Module | None:
@@ -565,9 +574,9 @@ class TorchReducer(ProbabilityReducer):
     def check(self) -> None:
         """Raise SettingError for a parameter out of its range.
 
-        folds must be an integer from 2 to 1000, batch_size one of at least 2, steps and fit_steps
-        of at least 1, shift of at least 0, all up to a million. n_components is 1 or 2,
-        learning_rate above 0, weight_averaging below 1, and no other number is negative or
+        Integers are folds from 2 to 1000, batch_size of at least 2, steps and fit_steps of at least
+        1, shift of at least 0 (these four up to a million), and n_components, 1 or 2. learning_rate
+        is above 0, weight_averaging below 1, and no other number is negative or
         infinite. checkpoint is a text or path; no file is looked at.
         """
         check_integers(
@@ -639,7 +648,8 @@ def draw_batches(
 def warm_optimizer() -> None:
     """Take a step on one weight, once in a process.
 
-    The first step of an optimiser imports a compiler, which takes two seconds.
+    The first step of an optimiser imports a compiler, which takes two seconds. Later calls do
+    nothing.
     """
     weight = nn.Parameter(torch.zeros(1))
     weight.grad = torch.zeros(1)
@@ -647,7 +657,7 @@ def warm_optimizer() -> None:
 
 
 def standard_normal(rng: np.random.Generator, *shape: int) -> Tensor:
-    """Draw a float32 tensor of a standard normal distribution."""
+    """Draw a float32 tensor of this shape from the standard normal distribution, by `rng`."""
     return torch.from_numpy(rng.standard_normal(shape, dtype=np.float32))
 
 

@@ -68,7 +68,7 @@ FIRST_EPOCHS = 200  # that a layout needs from a spectral start, in one training
 MIN_EPOCHS = 60  # of a later training
 MAX_EPOCHS = 200
 WORK = 240_000  # traces times epochs of a later training, between these two
-MAX_WORK = 400_000  # traces times epochs of any training, which bounds its time
+MAX_WORK = 400_000  # traces times epochs of any `train`, which bounds its time
 N_ITERATIONS = 5  # that move a new trace to where attraction balances; 20 decide hardly more parts
 SMALLEST_SQUARE = 1e-3  # of a distance between points, at which attraction is infinite
 MIN_SLOTS = 256  # for references in an encoder: many versions share one compiled module
@@ -129,7 +129,7 @@ class UmapEncoder(nn.Module):
         self.register_buffer("rates", torch.logspace(-2.0, 3.0, 48))
 
     def forward(self, x: Tensor) -> Tensor:
-        """(B, C, T) raw -> (B, 1, dim)."""
+        """Raw traces (B, C, T) -> points in the only space (B, 1, dim); see `embed_frames`."""
         return self.embed_frames(self.make_frames(x)).unsqueeze(1)
 
     @torch.jit.export
@@ -176,12 +176,18 @@ class UmapEncoder(nn.Module):
 
 
 def weighted_mean(points: Tensor, weights: Tensor) -> Tensor:
-    """Return the weighted means (B, dim) of points (B, n, dim), weights (B, n)."""
+    """Return the means (B, dim) of points (B, n, dim), weighted by `weights` (B, n).
+
+    The weights of a row need not sum to 1; NaN if they sum to 0.
+    """
     return (weights.unsqueeze(2) * points).sum(1) / weights.sum(1, keepdim=True)
 
 
 def padded(rows: Tensor, value: float) -> Tensor:
-    """Return rows (n, ...) with rows of `value` appended, to a power of two and at least 256."""
+    """Return rows (n, ...) with rows of `value` appended, in a new tensor.
+
+    The number of all rows is then the least power of two that is at least n and at least 256.
+    """
     n = len(rows)
     slots = max(MIN_SLOTS, 1 << (n - 1).bit_length())
     return torch.cat([rows, torch.full((slots - n, *rows.shape[1:]), value)])
@@ -204,8 +210,9 @@ class UmapReducer(Reducer):
     min_dist : float, default 0.1
         Distance in the embedding up to which neighbours are drawn together.
     n_epochs : int, optional
-        Epochs of every training. By default `fit` takes 200; `train` takes 240,000 / n, from 60
-        to 200, and at most 400,000 / n, which bounds its time.
+        Epochs of every training. By default `fit` takes 200. `train` takes those that are missing
+        to the first 200, and later 240,000 / n but at least 60; in both cases at most 200, and at
+        most 400,000 / n, which bounds its time.
     random_state : int, RandomState or None, default 0
         Seed of the negative samples, and of the noise on the points from which a layout starts.
 
@@ -280,10 +287,10 @@ class UmapReducer(Reducer):
         training; labels and folds are not read. The layout goes on from the last one if at least
         half of the traces were in it; otherwise, or without `numbers`, it starts anew; if none of
         them was in the last search of neighbours, or without `numbers`, the seed and the frames are
-        new as well. `stop` may end the epochs; after its deadline at most ten more are taken.
-        Returns the points of the traces, float32 (n, n_components), which share their memory with
-        `embedding_`. Raises the errors of `check_traces`, and SettingError for a parameter out of
-        its range, or too few traces.
+        new as well. `stop` may end the epochs; after its deadline at most ten more are taken. What
+        `precompute` found is used and then dropped. Returns the points of the traces, float32 (n,
+        n_components), which share their memory with `embedding_`. Raises the errors of
+        `check_traces`, and SettingError for a parameter out of its range, or too few traces.
         """
         traces = self._check(X, reset=not self._is_fitted)
         if numbers is None or not self._has_searched_any(numbers):
@@ -292,7 +299,7 @@ class UmapReducer(Reducer):
         return as_points(self.embedding_.numpy())
 
     def n_epochs_due(self, n_traces: int) -> int:
-        """Return the number of epochs that the next training takes on `n_traces` traces.
+        """Return the number of epochs that the next `train` takes on `n_traces` traces.
 
         It is `n_epochs` if that was given. Otherwise it is the number of epochs that are missing to
         the first 200; if none is missing, it is 240,000 / n_traces but at least 60. In both cases
@@ -415,7 +422,7 @@ class UmapReducer(Reducer):
     def _set_references(self, neighbors: Neighbors, points: Tensor) -> None:
         """Make traces and their points (n, n_components) the references of a new encoder.
 
-        `neighbors` holds the frames of the traces and their nearest neighbours. It replaces
+        `neighbors` holds the frames of the traces and their nearest neighbours. This replaces
         `neighbors_`, `embedding_` and `encoder_`, and drops what `precompute` found.
         """
         self.neighbors_ = neighbors
@@ -450,15 +457,24 @@ class UmapReducer(Reducer):
         return UmapEncoder(make_frames, references, points, self.n_neighbors, self.min_dist).eval()
 
     def module(self) -> UmapEncoder:
+        """Return the present `encoder_` itself, (B, C, T) -> (B, 1, d).
+
+        Later trainings replace it and do not change it. Raises NotFittedError before a fit.
+        """
         check_is_fitted(self, "encoder_")
         return self.encoder_
 
     @property
     def n_steps_left_(self) -> int:
+        """Return how many epochs the first layout still lacks, or 0.
+
+        That is 200, or `n_epochs` if given, less `n_epochs_`.
+        """
         return max(0, self._n_first_epochs - self.n_epochs_)
 
     @property
     def _n_first_epochs(self) -> int:
+        """Return the epochs that a first layout needs: `n_epochs`, or 200 if that is None."""
         return FIRST_EPOCHS if self.n_epochs is None else self.n_epochs
 
     @property

@@ -62,13 +62,17 @@ class Frames(nn.Module):
 
     @torch.jit.unused
     def learn(self, traces: Tensor) -> None:
-        """Set centre and scale of a new module, in place, from traces (n, C, T)."""
+        """Set centre and scale of a new module, in place, from traces (n, C, T).
+
+        The centre becomes the mean trace (C, T), the scale the root mean square of all frames of
+        the centred traces, or 1 if all traces are the same. Call it once: it reads the old scale.
+        """
         self.centre.copy_(traces.double().mean(0))
         deviation = self(traces).double().square().mean().sqrt()
         self.scale.copy_(torch.where(deviation > 0.0, deviation, 1.0))
 
     def forward(self, x: Tensor) -> Tensor:
-        """(B, C, T) -> (B, F)."""
+        """Raw traces (B, C, T) -> centred, scaled frames (B, F), channel after channel."""
         # The difference has memory that torch aligned. A product of other memory, or of other
         # strides, would differ in its last bits.
         rows = (x - self.centre).flatten(0, 1)
@@ -120,7 +124,10 @@ class Neighbors:
         )
 
     def rows_of(self, numbers: Ints) -> Tensor:
-        """Return the row of each number (m,) as int64 (m,); -1 if `numbers` lacks the number."""
+        """Return in which row of this object each label number of an array (m,) is: int64 (m,).
+
+        It is -1 for a number that this object does not have. The numbers may be in any order.
+        """
         row = np.searchsorted(self.numbers, numbers)
         return torch.from_numpy(np.where(np.isin(numbers, self.numbers), row, -1))
 
@@ -179,8 +186,8 @@ class Neighbors:
 def nearest_rows(frames: Tensor, rows: Tensor, count: int) -> Tensor:
     """Find the `count` nearest other traces of each row (B,).
 
-    Returns int64 (B, count): rows of `frames` (n, F), in no order. Distances are rounded, so that
-    the farthest of them may be wrong.
+    Returns int64 (B, count): rows of `frames` (n, F), in no order and without the row itself.
+    `count` must be below n. Distances are rounded, so that the farthest of them may be wrong.
     """
     squared = squared_distances(frames[rows], frames)
     squared[torch.arange(len(rows)), rows] = torch.inf
@@ -225,7 +232,8 @@ def nearest_candidates(
 ) -> tuple[Tensor, Tensor]:
     """Choose the k nearest of the candidates (B, m) of each row (B,) of `frames` (n, F).
 
-    Distances are computed from differences, so they are exact.
+    Distances are Euclidean and computed from differences, so they are exact. m must be at least k.
+    A row among its own candidates would count at distance 0.
 
     Returns
     -------
@@ -238,7 +246,10 @@ def nearest_candidates(
 
 
 def squared_distances(x: Tensor, y: Tensor) -> Tensor:
-    """Compute the squared distances between x (B, F) and y (m, F) by a matrix product: (B, m)."""
+    """Compute the squared distances between x (B, F) and y (m, F) by a matrix product: (B, m).
+
+    They are rounded, so that a small one may be wrong or negative.
+    """
     products = torch.addmm(y.square().sum(1), x, y.T, alpha=-2.0)
     return products.add_(x.square().sum(1, keepdim=True))
 

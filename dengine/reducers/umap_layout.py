@@ -188,7 +188,7 @@ class Edges:
         )
 
     def sum_by_head(self, values: Tensor) -> Tensor:
-        """Sum values of edges (d, E) over the edges of each head: (d, n)."""
+        """Sum values of edges (d, E) over the edges of each head: (d, n), 0 without edges."""
         lengths = self.counts.expand(len(values), -1).contiguous()
         return torch.segment_reduce(values, "sum", lengths=lengths, axis=1)
 
@@ -306,7 +306,8 @@ def learning_rates(n_epochs: int, stop: StopRule) -> Iterator[float]:
     `stop` is asked before each epoch. If `stop` limits the number of steps, the rate falls within
     that number. After its deadline at most ten more epochs are taken, over which the rate falls
     quickly, in equal steps towards 0: at a high rate the points would stay scattered by the
-    negative samples of the last epoch.
+    negative samples of the last epoch. There are never more than `n_epochs` rates, and none if
+    `stop` limits the steps to 0.
     """
     if stop.max_steps is not None:
         n_epochs = min(n_epochs, stop.max_steps)

@@ -91,17 +91,26 @@ class UmapLearnReducer(Reducer):
         return self
 
     def train(self, X: Floats, y: Ints, folds: Ints, *_: object, **__: object) -> Floats:
+        """Fit anew on traces X (n, C, T), and return the points of the fit, float32 (n, d).
+
+        `embed` may place the same traces elsewhere. Labels, folds, `stop` and `numbers` are not
+        read. Raises what `fit` raises.
+        """
         # The fit has placed its traces; `embed` would place them again, slowly.
         return as_points(self.fit(X).umap_.embedding_)
 
     def transform(self, X: ArrayLike) -> Floats:
+        """Place traces (n, T) or (n, C, T) together: float32 (n, d); see the class.
+
+        Raises NotFittedError before `fit`, and the errors of `check_traces`.
+        """
         check_is_fitted(self, "umap_")
         return self._transform_batch(self.check_traces(X))
 
     def embed(self, X: Floats) -> Floats:
         """Embed traces (n, C, T) one by one; return float32 (n, 1, d), in the only space.
 
-        Raises NotFittedError before `fit`.
+        Raises NotFittedError before `fit`, and the errors of `check_traces`.
         """
         check_is_fitted(self, "umap_")
         points = [self._transform_batch(trace[None]) for trace in self.check_traces(X)]
