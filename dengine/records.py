@@ -196,7 +196,7 @@ class TraceSpec:
         )
         expect(self.fit in FITS, f"fit to be one of {', '.join(FITS)}", self.fit)
         expect(
-            not columns or len(set(columns)) == self.channels,
+            not columns or len(set(columns)) == len(columns) == self.channels,
             f"{self.channels} different columns, one a channel",
             columns,
         )

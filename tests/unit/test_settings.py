@@ -119,6 +119,12 @@ FIRST = TraceSpec(100, channels=2)
 STATED = TraceSpec(100, 1000.0, 2, ("N", "mm"), columns=("force", "path"))
 
 
+@pytest.mark.parametrize("columns", ["a", "aa", "aab"])
+def test_columns_are_a_different_name_for_each_channel(columns):
+    with pytest.raises(SettingError, match="2 different columns, one a channel"):
+        TraceSpec(5, channels=2, columns=tuple(columns))
+
+
 @pytest.mark.parametrize("first", [FIRST, None], ids=["a contract", "the first trace"])
 def test_a_rate_is_stated_later_and_contradicted_never(first, make_data, tmp_path):
     url = tmp_path / "engine.db"
