@@ -441,8 +441,8 @@ class RadiusIndex(nn.Module):
 
         `state` is what `get_state` returned, and is not changed. With the same capacity each point
         has its old position. With a smaller `capacity` the newest points stay, as many as it holds.
-        With a larger one the oldest point is at the first position, and `total` no longer counts
-        points that left.
+        With a larger one the oldest point is at the first position, and `total` (the points ever
+        added) no longer counts points that left.
         """
         n = state["points"].shape[1]
         index = cls(len(state["points"]), capacity)

@@ -209,7 +209,9 @@ class Corrections:
         First a trained version is put in force or dropped, labels are stored, and news of peers is
         taken in, even if no version was pinned. The same model goes on, stored as a new version.
         Labels that came meanwhile count for the next retrain, which may be due at once. A training
-        under way in the executor is discarded, and begins again, even if no version was pinned.
+        under way in the executor is discarded, and begins again, even if no version was pinned. If
+        a version was pinned, and a safe mode began or ended meanwhile, an event is recorded, and
+        `on_safe_mode`, the user's function, is called.
 
         Parameters
         ----------

@@ -272,11 +272,12 @@ class DataEngine(AbstractContextManager["DataEngine"]):
     def _wait_until_warm(self) -> None:
         """Wait until the first retrain can begin without delay.
 
-        When it returns, the modules that a retrain imports are loaded, and the features of the
-        stored traces, which a retrain would compute first, are computed. If there are labels and no
-        version yet, this call begins to compute them, and also has the code for decisions compiled
-        if the model can be compiled; in other cases `Learner.resume` began to. There is no time
-        limit; if loading or computing fails, that is logged, and nothing is raised.
+        When it returns, the modules that a retrain imports are loaded, and what `Learner.resume`
+        began to compute is computed. If there are new labels and no version yet, this call also
+        computes the features of their traces, and compiles the code for decisions if the model can
+        be compiled. With a version in force it computes nothing: the next training itself computes
+        the features of traces that came since. There is no time limit; if loading or computing
+        fails, that is logged, and nothing is raised.
         """
         guarded(NOT_PRECOMPUTED, self._live.template.warm_up)
         if self.state.new_labels and not self.version:
@@ -728,11 +729,12 @@ class DataEngine(AbstractContextManager["DataEngine"]):
 
         A version that is pinned by a rollback is released first. In a product newer versions,
         corrections and labels of the other cells are taken in. A retrain that fails, has no label
-        to train on, or cannot be stored, is dropped: the report has `accepted` False then. A safe
-        mode is not announced here, but by the next `decide`, `report` or `poll`. Raises StoreError
-        if the labels that came before cannot be stored, in a product if the store does not answer,
-        and for an engine that is closed, was opened for reading or before a fork, or is in use by
-        another thread.
+        to train on, or cannot be stored, is dropped: the report has `accepted` False then. If a
+        version was pinned, its release announces a safe mode that began or ended; otherwise the
+        next `decide`, `report` or `poll` does. Raises StoreError if the release of a pinned version
+        cannot be stored, if the labels that came before cannot be stored, in a product if the store
+        does not answer, and for an engine that is closed, was opened for reading or before a fork,
+        or is in use by another thread.
 
         Parameters
         ----------

@@ -400,8 +400,10 @@ class Learner:
         With `to_the_end` it takes all steps that are left: test, learn newer labels, store, learn
         newer labels, put in force. No StoreError is raised: a candidate that cannot be stored, or
         whose labels cannot be stored before it, is dropped. A candidate that is stored waits for a
-        later call if the newest labels cannot be stored, which is logged. The time that this takes
-        before it is stored counts as work on the retrain, in its report.
+        later call if the newest labels cannot be stored, which is logged. A candidate without a
+        model, because its training or its test failed, is not put in force: only its report is
+        stored, and the previous version goes on. The time that this takes before it is stored
+        counts as work on the retrain, in its report.
         """
         candidate.begin_work()
         try:

@@ -176,8 +176,9 @@ class LiveModel:
     def swap_in(self, model: EngineModel, version: int, trained_on: TrainedOn) -> None:
         """Put a model in force, as the version of this number; nothing is stored.
 
-        `trained_on` names the labels of its training. The attributes `answering`, `version`,
-        `newest_version` (unless it is larger already), `trained_on` and `lacks_steps` are set. The
+        `trained_on` names the labels of its training. The attributes `answering` (the model in
+        force), `version`, `newest_version` (unless it is larger already), `trained_on` and
+        `lacks_steps` (whether its training ended before all its optimiser steps) are set. The
         caller hands the rule in force over to the model (`EngineModel.prepare`), before or after.
         """
         self.answering = model

@@ -307,7 +307,8 @@ def _check_description(texts: Mapping[str, str], name: str, description: str) ->
     """Raise SettingError if an object that is handed in again has other settings than before.
 
     `description` is that of the object. It is compared with the setting "described" of the store,
-    among `texts`, if there is one; if there is none, nothing is compared.
+    among `texts`, if there is one; if there is none, nothing is compared. `name` is the name of the
+    store, for the message.
     """
     made_with = texts.get("described")
     if made_with is not None and description != made_with:

@@ -297,9 +297,9 @@ class Retrainer:
         A successor starts from the weights of the current model, or from scratch; it is trained on
         the training window as it is now. `begin` is when work on the retrain began, in seconds by
         the clock. The current model is not changed. If the training fails, the outcome has no
-        model, and nothing is raised. How long the training took for its last step and the work
-        after it is remembered: the longest of the newest 20 is reserved in the time budget of the
-        next. This thread then has one torch thread.
+        model, and nothing is raised; but what copying a user's model raises is raised. How long the
+        training took for its last step and the work after it is remembered: the longest of the
+        newest 20 is reserved in the time budget of the next. This thread then has one torch thread.
         """
         data = self.window.snapshot()
         limits = (self._step_seconds(), self.max_steps)

@@ -190,11 +190,12 @@ class CostCurve:
 
     @property
     def missing(self) -> Missing | None:
-        """How many more parts would turn the verdict "may pay" into "pays", as a `Missing`.
+        """What evidence would turn the verdict "may pay" into "pays", as a `Missing`.
 
-        It assumes that the shares of wrong decisions stay as they were seen, and counts different
-        accepted parts, recordings, and parts of production. None if the verdict is another, or if
-        10,000 times the parts of a shuffle are too few.
+        It gives one need in three units: how many different accepted parts in all (those seen
+        included), how many further recordings, or how many parts of production would show it. It
+        assumes that the shares of wrong decisions stay as they were seen. None if the verdict is
+        another, or if 10,000 times the parts of a shuffle are too few.
         """
         row = self.marked
         if self.verdict != "may pay":
@@ -515,10 +516,11 @@ def find_policy(
     """Do what `cost_curve` does, with replays that the caller plays.
 
     `play` returns the replays of a list of tasks, in this order. If it returns fewer, as after
-    Ctrl-C, nothing more is played. The result is then computed from the fresh shuffles that every
-    policy has finished, if there are two or more. Otherwise it is computed from the earlier ones,
-    with its field `fresh` False; without two of these it is None. The other parameters are those of
-    `cost_curve`. Raises SettingError like that, and what `play` raises.
+    Ctrl-C, nothing more is played. The result is then computed from the fresh shuffles (by which no
+    policy was chosen) that every policy has finished, if there are two or more. Otherwise it is
+    computed from the earlier ones, with its field `fresh` False; without two of these it is None.
+    The other parameters are those of `cost_curve`. Raises SettingError like that, and what `play`
+    raises.
     """
     _check_search(data, costs, repeats)
     n_cycles = len(data) if cycles is None else cycles

@@ -76,7 +76,7 @@ def pooled_error(replays: Sequence[Any], side: str = "accepted", alpha: float = 
     Raises
     ------
     SettingError
-        An unknown side.
+        An unknown side; with decisions of that side also an alpha that is not between 0 and 1.
 
     References
     ----------

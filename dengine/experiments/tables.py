@@ -128,7 +128,8 @@ def promise_lines(rows: Sequence[Row]) -> list[str]:
     """Return a sentence for each row that `pool` returned: were at least LB of its accepted parts
     good?
 
-    LB is the lower bound of the row's policy. The sentence ends with "kept" or "broken", or says
+    A row has replays with the same settings, counted together. LB is the lower bound of its policy.
+    The sentence ends with "kept" or "broken", or says
     that no part, or too few parts, were accepted. It always names the recipe and the guarantee. It
     names the interval and alpha only if the rows differ in it.
     It has the share of good parts, and the interval of the share of bad parts.
@@ -180,8 +181,8 @@ def table_of_numbers(
     title, caption : str
         Texts above and below the table.
     rows : sequence of mappings
-        A mapping for each row, at least one: column title -> cell, with the same titles in all. The
-        first column has the names of the rows.
+        A mapping for each row, at least one: column title -> cell, with the same titles in the same
+        order in all. The first column has the names of the rows.
     total : bool, default False
         Draw a line above the last row.
     """

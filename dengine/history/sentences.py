@@ -139,7 +139,8 @@ def explain_in_words(
 
     `circumstances` are the settings and the state of the engine at the decision. If `bound` is
     None, the sentences on bounds are left out. The outcome is the label as corrected by now, or
-    that nothing was reported, which it also says of a forgotten label.
+    that nothing was reported, which it also says of a forgotten label. Raises SettingError for a
+    part outside the force limits if one does not fit the trace, which `item` must have.
     """
     decision = item.decision
     reason = _explain_reason(decision, item.trace, circumstances)

@@ -400,9 +400,10 @@ class RocketReducer(ProbabilityReducer):
         deadline leaves three. Components are new at the first fit, after every 20, and for at least
         1.5 times as many rows as the last ones. The heads of each `Tower` are written to `net_`,
         weighed to one logit. `towers_` and what a fit reports (`n_iter_`, most steps of a tower,
-        and `holdout_losses_`) are replaced, `n_fits_` grows, and with `numbers` the cache then has
-        these traces alone. Returns the points of the traces, float32 (n, d), row i in embedding
-        space ``folds[i]``, whose head did not see the label of row i.
+        and `holdout_losses_`, the log loss of each head on the rows of its fold) are replaced,
+        `n_fits_` grows, and with `numbers` the cache of features then has these traces alone.
+        Returns the points of the traces, float32 (n, d), row i in embedding space ``folds[i]``,
+        whose head did not see the label of row i.
         """
         raw = self.raw_features(traces, numbers)
         with torch.no_grad():
@@ -610,10 +611,10 @@ class RocketReducer(ProbabilityReducer):
     def set_state(self, state: Arrays) -> Self:
         """Restore what `get_state` returned, and return self; the parameters must be the same.
 
-        Afterwards the cache of features is empty.
-        Raises SettingError for a parameter out of its range, and StoreError if the sizes do not
-        follow from the parameters; then the fitted model is lost. Raises KeyError if shape,
-        counters or losses are missing.
+        Afterwards the cache of features is empty. Raises SettingError for a parameter out of its
+        range, StoreError if the sizes do not follow from the parameters, and KeyError if the shape,
+        the counters (of fits, traces and steps) or the losses (log loss of each space) are missing.
+        After an error the fitted model is lost.
         """
         channels, samples = self.restore_shape(state)
         average, *counts = map(int, state["counts"])

@@ -49,11 +49,12 @@ class RecordInsertion:
         that contradicts the store, like another label of a labelled decision, or a label whose
         decision is not stored, becomes a dead letter: an event that says what was in it, and that
         is logged. A late stop (`_is_late_stop`) corrects the label of its part to failure, with an
-        event, and has its pair. A label of a quarantined trace is quarantined. If the database
-        refuses a value, the records are halved, each half in a transaction of its own, until the
-        refused record is alone; it becomes a dead letter, too. A label that became a dead letter
-        has no pair. Raise StoreError if the database fails in another way; halves that were
-        committed before stay.
+        event, and has its pair. A late stop of a label that was forgotten is a dead letter; if the
+        label counts as a failure already, the late stop changes nothing. A label of a quarantined
+        trace is quarantined. If the database refuses a value, the records are halved, each half in
+        a transaction of its own, until the refused record is alone; it becomes a dead letter, too.
+        A label that became a dead letter has no pair. Raise StoreError if the database fails in
+        another way; halves that were committed before stay.
         """
         try:
             return self._database.write(lambda connection: self._insert(connection, records))

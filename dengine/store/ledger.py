@@ -463,7 +463,7 @@ def _chain_statement(
     and their sum. All other statements, and all those outside a write transaction of `Database`,
     are returned unchanged; if settings are written, the entry will have a copy of them all. Raise
     StoreError for an insert into a table of CHAINED whose rows are inside the statement instead of
-    its parameters.
+    its parameters, and TypeError for a value of such a row that `row_sum` refuses.
     """
     entry: LedgerEntry | None = connection.get_execution_options().get("dengine_entry")
     if entry is None or not isinstance(statement, sa.Insert | sa.Update | sa.Delete):

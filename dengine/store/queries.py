@@ -124,7 +124,9 @@ def newest_of(
     """Return the query for the largest number in a column over a product's cells; it is not run.
 
     With `conditions`, only over the rows that fulfil them all. The result is NULL if there is none.
-    The query is fast: the database reads one row of the index for each cell.
+    `column` has a table's row numbers. In the table of versions each cell's newest retrain that
+    fulfils the conditions counts, so a column must increase with `retrain`. The query is fast: for
+    each cell the database reads the index from its end, one row if the conditions hold there.
     """
     table = column.table
     peer = cells_of(product).subquery()

@@ -122,7 +122,9 @@ class Recorder:
 
         Return at once the record's `Entry`, which will say where it stands in the journal. If the
         disk answers, the thread writes it within about BATCH_SECONDS (0.05 s), together with
-        others. There is no limit to the number of records that wait.
+        others; after a failed write it tries again up to RETRY_SECONDS (1 s) later. Before `start`
+        and after `stop` the record only stays in memory, without an error. There is no limit to the
+        number of records that wait.
         """
         entry = Entry(record)
         with self.changed:

@@ -202,9 +202,9 @@ class LabelReader:
         return meanings[words[0]]
 
     def unused_note(self) -> str:
-        """Return a sentence on the keys of the listing in which no recording was found, or "".
+        """Return a sentence on rows of the listing that name no recording, "" if there is none.
 
-        It names up to eight of them, with the number of all.
+        It has the keys of up to eight of them, with the number of all.
         """
         unused = sorted(self.listing.keys() - self.used, key=natural_key)
         if not unused:
