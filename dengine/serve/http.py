@@ -359,7 +359,9 @@ class HttpApi:
             selection = replace(selection, action=Action.VERIFY, label="none")
 
         def read_newest(store: SqlStore) -> list[StoredDecision]:
-            """Return the newest decisions that were asked for, and one more if there are more."""
+            """Return the newest decisions that were asked for, newest first, and one more if there
+            are more; with `open_` without those whose label was forgotten.
+            """
             decisions = iterate_decisions(store, selection, limit + 1, before or None)
             if open_:  # a forgotten label was reported
                 decisions = (stored for stored in decisions if stored.source is None)
@@ -438,7 +440,9 @@ class HttpApi:
         return StreamingResponse(event_stream(), media_type="text/event-stream")
 
     async def me(self) -> Token:
-        """Return the name and the rights of the request's token."""
+        """Return the name and the rights of the request's token, without its secret. If the server
+        needs no token, the name is empty, and everything is allowed.
+        """
         return CURRENT_TOKEN.get()
 
     async def metrics(self) -> Response:
@@ -546,7 +550,9 @@ def create_app(
 ) -> Starlette:
     """Create the application. The caller closes the service after it has ended.
 
-    The service gets an observer, which counts its responses for `GET /metrics`.
+    It serves the operations of `HttpApi`, XML-RPC at POST /RPC2 (`RobotCalls`), and the web page.
+    Every request first passes `Guard`; errors become `Problem`s. The service gets an observer,
+    which counts its responses for `GET /metrics`.
 
     Parameters
     ----------

@@ -79,8 +79,9 @@ class Metrics:
         """Add the duration (`seconds`) of a response or a retrain to the histogram of its type.
 
         There are three histograms: of decisions, reports and retrains. Their Prometheus labels are
-        values of the fields that `HISTOGRAMS` names, in lower case: for a decision its action and
-        its reason. Returns nothing.
+        values of the fields that `HISTOGRAMS` names, in lower case: of a decision its action and
+        its reason, of a report its label and whether it was repeated, of a retrain whether it was
+        accepted. Returns nothing. Raises KeyError for any other type.
         """
         kind = type(response)
         record = response.decision if isinstance(response, ServiceResponse) else response
@@ -88,7 +89,8 @@ class Metrics:
         self._histograms[kind].labels(*labels).observe(response.seconds)
 
     def text(self) -> bytes:
-        """Return all metrics in Prometheus's text format."""
+        """Return all metrics in Prometheus's text format: the histograms, and what `collect` gives.
+        """
         return generate_latest(self._registry)
 
     def collect(self) -> Iterator[Metric]:

@@ -220,7 +220,10 @@ class AddressSpace:
         self._events.event.SourceName = "Cell"
 
     def _node(self, name: str) -> Node:
-        """Return the node of a variable or a method of the cell."""
+        """Return the node of a variable or a method of the cell, whose NodeId is "Cell.NAME".
+
+        Whether the server has such a node is not checked. `build` must have been called.
+        """
         return self._server.get_node(f"ns={self._namespace};s=Cell.{name}")
 
     async def decide(self, trace: list[float], channels: int, request: str, part: str) -> list[Any]:
@@ -233,9 +236,10 @@ class AddressSpace:
 
         If the queue is full, or the service or its engine is closed, the result is VERIFY with an
         empty id, the reason "busy", the bounds 0 and 1, and version 0. Raises TraceError if the
-        trace is empty, if its length is not a multiple of `channels`, for a trace or part that the
-        engine does not take, and for an id of another trace. Raises ReportError for an invalid id,
-        and SettingError for a first trace that the settings do not allow.
+        trace is empty, if `channels` is below 1 or the trace's length no multiple of it, for a
+        trace or part that the engine does not take, and for an id of another trace. Raises
+        ReportError for an invalid id, and SettingError for a first trace that the settings do not
+        allow.
         """
         if channels < 1 or len(trace) % channels or not trace:
             raise TraceError(

@@ -327,8 +327,9 @@ class CellService:
     async def find(self, decision_id: str) -> StoredDecision | None:
         """Return a decision with its trace and label, after waiting for the engine's thread.
 
-        None for an unknown id. Raises BusyError if the queue is full or the service is closing,
-        StoreError if the id cannot be looked up, and ReportError for an invalid id.
+        None for an unknown id. Listeners to `changes` are not notified. Raises BusyError if the
+        queue is full or the service is closing, StoreError if the id cannot be looked up, and
+        ReportError for an invalid id.
         """
         return await self.call(lambda engine: engine.find(decision_id), read_only=True)
 
@@ -391,12 +392,15 @@ class CellService:
 
     @property
     def waiting(self) -> int:
-        """Requests in the queue."""
+        """Number of requests in the queue, without the one that the engine's thread works on."""
         return self._jobs.qsize()
 
     @property
     def silent_seconds(self) -> float:
-        """Seconds since the engine's thread last took or awaited a job; infinity if it ended."""
+        """Seconds since the engine's thread last began to wait for a job; infinity if it ended.
+
+        They grow while it works on one job, or on a retrain that runs in this thread.
+        """
         if not self._thread.is_alive():
             return float("inf")
         return time.monotonic() - self._last_active
@@ -423,7 +427,10 @@ class CellService:
             self._listeners.discard(listener)
 
     def end_listening(self) -> None:
-        """End every iteration over `changes`, for good, because the server is about to close."""
+        """End every iteration over `changes`, for good, because the server is about to close.
+
+        Requests are still answered. It returns at once, and may be called in any thread.
+        """
         self._listening_ended = True
         self._notify_listeners()
 
@@ -513,7 +520,9 @@ class CellService:
             timeout = SHORT_WAIT if engine.state.is_swapping else IDLE_WAIT
 
     def _notify_listeners(self) -> None:
-        """Wake every iteration over `changes`, in its event loop."""
+        """Wake every iteration over `changes`, in its event loop; one whose loop has ended is
+        passed over. It may be called in any thread.
+        """
         for loop, event in tuple(self._listeners):
             with suppress(RuntimeError):  # the loop has ended
                 loop.call_soon_threadsafe(event.set)
