@@ -142,7 +142,9 @@ def _label_text(stored: StoredDecision) -> str:
 
 
 def _model_text(stored: StoredDecision) -> str:
-    """Return what the model alone would have done, "" if that is what was done."""
+    """Return the action that the model alone would have taken, like "accept"; "" if that is the
+    action of the decision.
+    """
     predicted = stored.decision.predicted
     return "" if predicted is stored.decision.action else predicted.value
 
@@ -205,7 +207,9 @@ def _history_table(items: Sequence[StoredDecision | StoredVersion | Event]) -> s
 def _event_line(item: StoredVersion | Event) -> str:
     """Return the line of an event or a retrain: its time in UTC, what happened, and why.
 
-    The line of a retrain also has the number of traces and the duration.
+    The line of a retrain also has the number of traces and the duration; it names the version that
+    was put in force, or, if the retrain was dropped, the number of the retrain. The text of an
+    event is put on one line.
     """
     from ..store.records import Event
 

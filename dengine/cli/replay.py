@@ -359,7 +359,10 @@ def _replay_and_print(
 def _group_replays(
     replays: Sequence[Replay], key: Callable[[Replay], str]
 ) -> dict[str, list[Replay]]:
-    """Return a dict: `key(replay)` -> the replays with this key, which follow each other."""
+    """Return a dict: `key(replay)` -> the replays with this key, in their order.
+
+    Replays with one key must follow each other; otherwise only those of the last group count.
+    """
     return {name: list(group) for name, group in groupby(replays, key)}
 
 
@@ -590,7 +593,8 @@ def _curve_lines(curve: CostCurve, dataset: Dataset) -> list[str]:
 def _as_flags(settings: Options) -> str:
     """Return settings of a policy, given by name, as options of the command line in one text.
 
-    It is like "--alpha 0.1 --lower-bound 0.9"; the prices are joined by commas.
+    It is like "--alpha 0.1 --lower-bound 0.9", in the order of the settings; the prices are joined
+    by commas. Without settings it is "".
     """
     texts = {
         name: ",".join(f"{price:g}" for price in value) if name == "prices" else str(value)

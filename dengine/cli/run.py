@@ -303,6 +303,8 @@ def _robot_cell(source: DataChoice, host: str | None, **others: Any) -> CellToDr
 def host_and_port(address: str) -> tuple[str, int]:
     """Split HOST[:PORT] of a robot controller, and return both; without PORT it is 30004, RTDE's.
 
+    HOST may come back empty, for an `address` without one.
+
     Raises
     ------
     SettingError

@@ -151,9 +151,10 @@ def _present_rows(report: "Status") -> list[tuple[str, str]]:
 
 
 def _without_audits(counts: dict[str, int]) -> dict[str, int]:
-    """Return counts with the key "audit" renamed to "certain but checked".
+    """Return counts with the key "audit" renamed to "certain but checked", in a new dict.
 
-    For a policy without audits: what has that reason was verified in shadow mode.
+    For a policy without audits: what has that reason was verified in shadow mode. Without that key
+    the counts are the same.
     """
     return {TITLES["audits"] if name == "audit" else name: n for name, n in counts.items()}
 

@@ -51,10 +51,10 @@ class JournalLine:
     trace : array of float32, shape (C, T)
         Empty for a rejected part.
     label : bool or None
-        None if no outcome was reported.
+        True good, False bad; None if no outcome was reported.
     late : bool
-        Whether the label came after the next part was decided. An accepted part then has a line of
-        its own before it.
+        Whether the label came after the next part was decided. An accepted part then also has an
+        earlier JournalLine, without the label.
     """
 
     decision: Decision
@@ -115,8 +115,8 @@ def read_journal(path: FilePath, spec: TraceSpec) -> CellJournal:
     ------
     DataError
         For a file that is no journal of format 4, the present one (`FORM`), a line whose checksum
-        fits but which cannot be read as `spec` says, or a journal with neither an accepted nor a
-        labelled part.
+        fits but which cannot be read as `spec` says or has the label of a part without a line, or a
+        journal with neither an accepted nor a labelled part.
     OSError
         If the file cannot be read.
     """

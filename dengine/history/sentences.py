@@ -80,7 +80,9 @@ class Circumstances:
 
     @property
     def baseline(self) -> str:
-        """Name of a handed-in model that decides by its own method; "" for any other model."""
+        """Name of a handed-in model whose thresholds are not known, which is taken to decide by its
+        own method; "" for any other model.
+        """
         return self.model if self.model is not None and self.thresholds is None else ""
 
 
@@ -139,7 +141,8 @@ def explain_in_words(
 
     `circumstances` are the settings and the state of the engine at the decision. If `bound` is
     None, the sentences on bounds are left out. The outcome is the label as corrected by now, or
-    that nothing was reported, which it also says of a forgotten label.
+    that nothing was reported, which it also says of a forgotten label. Raises SettingError for a
+    part outside the force limits if one of them does not fit its trace.
     """
     decision = item.decision
     reason = _explain_reason(decision, item.trace, circumstances)
