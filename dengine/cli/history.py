@@ -51,9 +51,9 @@ class Moment(click.ParamType):  # type: ignore[type-arg]  # click made it generi
     ) -> float:
         """Return the time in seconds since 1970; a usage error for a text that is no time.
 
-        "30m" is 30 minutes before now (likewise s, h and d); otherwise the text is a date, with or
-        without a time, in ISO 8601, which is in UTC if it has no offset. A date alone is its
-        midnight.
+        "30m" is 30 minutes before now (likewise s, h and d, also with decimals); otherwise the text
+        is a date, with or without a time, in ISO 8601, which is in UTC if it has no offset. A date
+        alone is its midnight. Dates may lie in the future.
         """
         ago = re.fullmatch(r"(\d+(?:\.\d+)?)([smhd])", value)
         if ago:
@@ -180,8 +180,9 @@ def _history_table(items: Sequence[StoredDecision | StoredVersion | Event]) -> s
     """Return a table of decisions as text, in the order of the items.
 
     It has a row for each decision, with the columns in `COLUMNS`, from its time to its label.
-    Retrains and events are lines between its rows, cut to 119 characters; the rows are not cut.
-    Without any item the text is a sentence that says so.
+    Retrains and events are lines between its rows, cut to 119 characters; the rows are not cut. Two
+    lines of titles come first, also if no item is a decision. Without any item the text is a
+    sentence that says so.
     """
     from ..store.records import StoredDecision
 

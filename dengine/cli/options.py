@@ -174,7 +174,7 @@ def bundle_options(into: str, make: Callable[..., Any], options: Mapping[str, Op
     """
 
     def decorate(command: Command) -> Command:
-        """Return the command with the options, and with one argument in their place."""
+        """Return the command with the options, and with one argument `into` in their place."""
 
         @wraps(command)
         def bundled(**values: Any) -> Any:
@@ -190,7 +190,10 @@ def bundle_options(into: str, make: Callable[..., Any], options: Mapping[str, Op
 
 
 def drop_none(**values: Any) -> dict[str, Any]:
-    """Return the options that were given, by name: those whose value is not None."""
+    """Return the options that were given, by name: those whose value is not None.
+
+    False, 0 and "" were given, too.
+    """
     return {name: value for name, value in values.items() if value is not None}
 
 
@@ -771,7 +774,9 @@ def out_option(
     """
 
     def make_out(out: Path | None, force: bool) -> Out | None:
-        """Return the `Out`, None without `--out`; OutputError if a file must not be written."""
+        """Return the `Out`, None without `--out`; OutputError if one of the files `names` must not
+        be written. Nothing is created.
+        """
         from ..files import check_output
 
         if out is None:

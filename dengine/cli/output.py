@@ -340,8 +340,10 @@ FORMATTERS: dict[str, Callable[[float], str]] = {
 
 
 def certificate_record(certificate: "Certificate") -> Record:
-    """Return a certificate as a dict for JSON: all its fields, its verdict as `kept`, and its
-    sentences on accepted and rejected parts as `sentence` and `sentence_on_rejects`.
+    """Return a certificate as a dict for JSON.
+
+    It has all its fields, `kept` (whether the bound on accepted parts lies within the tolerance),
+    and its sentences on accepted and on rejected parts, `sentence` and `sentence_on_rejects`.
     """
     sentences = ("kept", "sentence", "sentence_on_rejects")
     return asdict(certificate) | {name: getattr(certificate, name) for name in sentences}

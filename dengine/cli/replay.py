@@ -511,7 +511,7 @@ def costs(
 
     def play(tasks: Sequence[Task]) -> list[Replay]:
         """Play tasks with a progress bar; return the finished replays in the order of the tasks,
-        and keep what interrupted them in `error`.
+        and keep what interrupted them in `error`, None if nothing did.
         """
         nonlocal error
         played, error = _play(dataset, tasks, stream)
@@ -625,9 +625,9 @@ def _cost_cells(row: PolicyCost, is_chosen: bool) -> tuple[str, ...]:
 
 def _error_cell(error: ErrorRate) -> str:
     """Return how many decisions were wrong, like "3 of 120", and in a second line the interval of
-    their share in percent.
+    their share in percent, like "0.5 to 7.1 %".
 
-    It is "-" if there was no decision.
+    The ends have two significant digits. It is "-" if there was no decision.
     """
     if not error.decided:
         return "-"

@@ -204,11 +204,12 @@ def _safe_mode_line(change: Record) -> str:
 def _simulated_cell(scenario: str, cycles: int, source: DataChoice, **others: Any) -> CellToDrive:
     """Return the `TraceSpec` of the simulated cell, and a function that makes the cell.
 
-    The `TraceSpec` has what the options of `source` state; the rest is the simulation's own. The
+    The `TraceSpec` is the simulation's own, or what the options of `source` state; rate, unit and
+    names of channels that these leave out are then the simulation's, if the shape is the same. The
     cell's seed depends on the number of decisions in the store, and in a product also on the cell,
     so that no part comes twice. `scenario` says what changes in the course of the `cycles`; for an
     unknown one SettingError is raised when the cell is made. `others` are settings of other kinds
-    of cell, and are ignored.
+    of cell, and are ignored. Raises what `trace_spec_from` raises.
     """
     from ..cells.simulation.cell import SimulatedCell
 
@@ -247,8 +248,8 @@ def _replay_cell(source: DataChoice, cycles: int, **others: Any) -> CellToDrive:
     dataset = source.load()
 
     def make(engine: DataEngine) -> tuple[Cell, str]:
-        """Return the rest of the recording as a cell, and its name; SettingError if too few parts
-        are left.
+        """Return the parts after the last one that this engine's store knows as a cell, and its
+        name; SettingError if fewer than `cycles` are left.
         """
         store = engine.store
         # By the content of the traces: the store's own hash is one number for a part that comes

@@ -117,7 +117,9 @@ def report(part: str, label: str, **changing: Any) -> None:
     from ..history.explain import find_decision_id
 
     def change(engine: DataEngine, author: str) -> Changed:
-        """Report the label and record an event; report nothing if the decision has that label."""
+        """Report the label and record an event; if the decision has that label already, do nothing,
+        and return a `Changed` without an event that says so.
+        """
         id_ = find_decision_id(engine.store, part)
         stored = engine.find(id_)
         if stored is not None and stored.success is LABELS[label]:

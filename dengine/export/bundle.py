@@ -268,9 +268,10 @@ def write_export(
 ) -> Path:
     """Write a file, its checksum (PATH.sha256) and, with a key, its signature (PATH.sig).
 
-    Each file is put in place by a rename. If the process is killed between two renames, the file
-    may be refused as damaged until it is exported again. Before anything is written, the export is
-    recorded as an event of the engine, so the event may be there without the file.
+    The folder must exist. Each file is put in place by a rename. If the process is killed between
+    two renames, the file may be refused as damaged until it is exported again. Before anything is
+    written, the export is recorded as an event of the engine, so the event may be there without the
+    file.
 
     Parameters
     ----------

@@ -284,7 +284,7 @@ class ExportedModel:
 
     @property
     def safe_mode(self) -> str:
-        """Why the safe mode began, in words; "" outside of a safe mode."""
+        """Why the safe mode began, in words (`SAFE_MODES`); "" outside of a safe mode."""
         return SAFE_MODES[self.module.safe_mode()]
 
     def save(self, path: FilePath, *, key: FilePath | None = None, force: bool = False) -> Path:

@@ -528,7 +528,7 @@ def _estimate_error(
 def _verdict(lower: float, upper: float, tolerance: float) -> str:
     """Return "kept" if the interval is below the tolerance, "broken" if above, else "open".
 
-    An upper end equal to the tolerance is below it.
+    An upper end equal to the tolerance is below it; a lower end equal to it is not above it.
     """
     if upper <= tolerance:
         return "kept"

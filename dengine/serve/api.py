@@ -289,7 +289,7 @@ def _described(hint: Any, text: str) -> Any:
 
 
 class Health(Struct):
-    """Whether the engine answers."""
+    """Whether the engine answers, and what is wrong with it: the response of /healthz."""
 
     status: Literal["ok", "degraded", "down"]
     store_fault: Annotated[str, Meta(description="Why the store cannot be written, or empty.")]
@@ -498,8 +498,7 @@ class Operation:
 
     @cached_property
     def request_type(self) -> type[Struct]:
-        """The struct type with the fields of a POST's body, or of a GET's query and path; cached.
-        """
+        """The struct type with the fields of a POST's body or a GET's query and path; cached."""
         return _request_type(self.handler, self.optional_fields)
 
     async def serve(self, request: Request) -> Response:
@@ -576,7 +575,7 @@ class Operation:
 
 
 def _json_content(name: str, media: str = JSON) -> Json:
-    """Return an OpenAPI content object: JSON of the named schema, as the given media type."""
+    """Return an OpenAPI content object, a dict: `media` -> a reference to the schema `name`."""
     return {media: {"schema": {"$ref": REF.format(name=name)}}}
 
 

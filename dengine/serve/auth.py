@@ -324,7 +324,9 @@ def _limit_body(receive: Receive) -> Receive:
     bytes_left = MAX_BODY
 
     async def receive_body() -> Message:
-        """Return the next message, and count its bytes; raise HTTPException 413 for too many."""
+        """Return the next message, and subtract its bytes from those that are left; raise
+        HTTPException 413 for too many.
+        """
         nonlocal bytes_left
         message = await receive()
         bytes_left -= len(message.get("body", b""))

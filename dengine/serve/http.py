@@ -100,8 +100,8 @@ class HttpApi:
 
     @cached_property
     def operations(self) -> list[Operation]:
-        """The `Operation` of every path and method: its handler, and the type of its response;
-        cached.
+        """The `Operation` of every path and method of the interface: its handler, and the type of
+        its response; cached. XML-RPC and the web page are not among them (see `create_app`).
         """
         # A guarantee may name a class, and no request over the network may cause an import.
         policy = field_types(Policy, "guarantee") | {"force_limits": list[str]}
@@ -298,7 +298,8 @@ class HttpApi:
             """Release a pinned version, record an event, begin the retrain, and return what
             changed.
 
-            If a retrain is under way, or waits until it can begin, nothing is done.
+            If a retrain is under way, or waits until it can begin, nothing is done, and the
+            `Changed` has no event.
             """
             event = None
             text = "A retrain is under way already; nothing changed."
@@ -432,7 +433,9 @@ class HttpApi:
         """
 
         async def event_stream() -> AsyncIterator[str]:
-            """Yield hello, then changed or tick, as texts of server-sent events."""
+            """Yield hello, then changed or tick, as texts of server-sent events, until the service
+            ends its iterations.
+            """
             yield f"retry: {RECONNECT_MS}\nevent: hello\ndata: {__version__}\n\n"
             async for changed in self.service.changes(TICK):
                 yield f"event: {'changed' if changed else 'tick'}\ndata: -\n\n"

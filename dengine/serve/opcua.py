@@ -328,7 +328,8 @@ class AddressSpace:
 
         async def method(parent: ua.NodeId, *variants: ua.Variant) -> Any:
             """Check the arguments, call, and return the results; for an error write its text into
-            LastRefused, and return a bad status code.
+            LastRefused, and return a bad status code: BadInternalError for an unexpected error,
+            BadInvalidArgument for any other. `parent` is not used.
             """
             # Controllers send an empty text as null.
             texts = [ua.Variant("") if item.Value is None else item for item in variants]
@@ -356,7 +357,9 @@ def _type_of(argument: ua.Argument) -> VariantType:
 
 
 def _form(variant_type: VariantType, is_array: bool) -> str:
-    """Return the name of an argument's type for messages, such as "Float array"."""
+    """Return the name of an argument's type for messages: "Float array" if `is_array`, else
+    "Float". Two arguments have the same type if these names are equal.
+    """
     return f"{variant_type.name}{' array' * is_array}"
 
 

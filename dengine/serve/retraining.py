@@ -170,7 +170,9 @@ def _prepare_process() -> None:
 
 
 def _warm_up() -> None:
-    """Import torch and its optimisers in this process, before the first retrain."""
+    """Import torch and take one step of its optimiser in this process, so that the first retrain
+    need not wait for what torch imports then.
+    """
     from ..reducers.torch_reducer import warm_optimizer
 
     warm_optimizer()

@@ -193,7 +193,7 @@ def serve(
             server = CellServer(uvicorn.Config(app, **options), service, lambda: say(line))
 
             async def run() -> None:
-                """Start what runs beside the server, and serve until a signal comes."""
+                """Start what runs beside the server, serve until a signal comes, and end it."""
                 async with AsyncExitStack() as stack:
                     for start in beside:
                         await stack.enter_async_context(start(service))

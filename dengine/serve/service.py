@@ -150,6 +150,9 @@ class CellService:
     observers : list of callable
         Each is called with every ServiceResponse, ReportResponse and RetrainReport, in the thread
         where it arises.
+    read_store : SqlStore
+        The second connection to the store, by which `read` reads; the engine's own store if that is
+        in memory.
     """
 
     def __init__(
@@ -233,7 +236,9 @@ class CellService:
         # With the caller's id the decision must be on disk before the response: the caller may
         # send the request again. Without one it cannot.
         def work(engine: DataEngine, late: bool) -> Decision:
-            """Decide in the engine's thread; `late` says that the caller has timed out."""
+            """Decide in the engine's thread; `late` says that the caller has timed out, so that the
+            part is recorded as VERIFY under `id_` without asking the model.
+            """
             decision_id = id_ if late or request is not None else None
             return engine.decide(trace, part, decision_id=decision_id, timed_out=late)
 
@@ -296,7 +301,9 @@ class CellService:
             """
 
             def has_label() -> bool:
-                """Return whether the decision has the reported label already."""
+                """Return whether the decision has the reported label already, as corrected; False
+                for an unknown id, and without a label.
+                """
                 stored = engine.find(decision_id)
                 return stored is not None and stored.success is label
 

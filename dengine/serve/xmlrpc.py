@@ -105,7 +105,9 @@ async def call_method(calls: RobotCalls, body: bytes) -> bytes:
 
 
 def fault(code: int, text: str) -> bytes:
-    """Return an XML-RPC fault as bytes, its text as one printable line of at most 300 characters.
+    """Return an XML-RPC fault, a method response in XML, as bytes.
+
+    Its text is put on one printable line and cut to 300 characters (`one_line`).
     """
     error = xmlrpc.client.Fault(code, one_line(text))
     return xmlrpc.client.dumps(error, methodresponse=True).encode("utf-8", "replace")
