@@ -279,6 +279,7 @@ def _robot_cell(source: DataChoice, host: str | None, **others: Any) -> CellToDr
 
     The robot is a Universal Robots controller at `host`, HOST or HOST:PORT. The options of `source`
     say what is recorded, and when; `others` are settings of other kinds of cell, and are ignored.
+    Nothing is connected before the function is called. The cell's `close` ends the connection.
 
     Raises
     ------

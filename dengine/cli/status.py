@@ -163,8 +163,8 @@ def _span_cell(name: str, span: "Span") -> str:
     """Return the text of a field of a `Span`: a time, a number, or a share of wrong decisions with
     its verdict.
 
-    A `Span` has the counts over the newest decisions, or over all, and `name` names its field. A
-    few words replace the share if there is none, because no part was accepted.
+    A `Span` has the counts over the newest decisions, or over all, and `name` names its field.
+    "none was accepted" replaces the share of bad accepted parts if no part was accepted.
     """
     value = getattr(span, name)
     if name in ("first", "last"):

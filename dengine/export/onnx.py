@@ -232,6 +232,8 @@ class OnnxModel:
 class OnnxDecision(nn.Module):
     """The decision without a branch, in tensors; the references do not change.
 
+    It has a copy of the model's references.
+
     Parameters
     ----------
     source : Exportable

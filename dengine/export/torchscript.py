@@ -172,8 +172,10 @@ class ExportedDecision(NamedTuple):
     Attributes
     ----------
     action, reason, lower, upper, n_success, n_failure
-        As of `Decision`.
+        Like those of `Decision`: what to do and why, the bound of the success probability, and the
+        good and bad labels within the radius; the bound is (0, 1) without a prediction.
     embedding : array of float32, shape (K, d)
+        A point in each embedding space; NaN for a faulty trace.
     """
 
     action: Action

@@ -522,10 +522,10 @@ def _read_explanation(store: SqlStore, id_: str) -> Json:
     """Return the explanation of a decision, named by its id or its part's number, as a JSON dict.
 
     Beside the `Explanation` it has the decision's trace, the corrections of its label, the envelope
-    (low, median, high; None without one), and the newest `N_BADS` traces of bad parts among the
-    newest `N_LABELS` labels of cell and product (none if their shape differs). Raises what
-    `explain` raises, such as StoreError for a damaged trace; other damaged rows are left out, and
-    an event says so.
+    (low, median, high; None without one), and the newest `N_BADS` (10) traces of bad parts among
+    the newest `N_LABELS` (200) labels of cell and product, oldest first (none if their shape
+    differs). Raises what `explain` raises, such as StoreError for a damaged trace; other damaged
+    rows are left out, and an event says so.
     """
     explanation = explain(store, id_)
     trace = explanation.trace

@@ -185,6 +185,9 @@ async def opcua_server(
 class AddressSpace:
     """The nodes of one cell in an OPC UA server: its variables, methods and alarm events.
 
+    `opcua_server` makes it, and calls `build` and then `refresh`, all in the server's event loop.
+    Its methods have no recorder, and of the methods of `RobotCalls` only `decide` and `report`.
+
     Parameters
     ----------
     server : Server

@@ -67,6 +67,9 @@ UNRECORDED: Struct = {"action": 0, "id": "", "lower": 0.0, "upper": 1.0, "versio
 class RobotCalls:
     """The methods that a robot's program can call, on one service.
 
+    They run in the server's event loop. The pieces of traces that `add` took are only in this
+    object, not in the store; XML-RPC and OPC UA have an object each.
+
     Parameters
     ----------
     service : CellService
@@ -226,7 +229,8 @@ class RobotCalls:
         `RECORD_SECONDS` for the recording. Only the part of the newest `begin` has a recording, and
         only for one call, even if that call times out or is refused. If there is no recording, or
         the recorder fails, which is logged, the result is verify with an id "" and the reason
-        "not_recorded", and nothing is stored.
+        "not_recorded", and nothing is stored. An insertion that is incomplete after this time has
+        NaN for its missing samples, so it is verified and stored with that fault.
 
         Parameters
         ----------
