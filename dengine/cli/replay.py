@@ -606,8 +606,10 @@ def _as_flags(settings: Options) -> str:
 def _cost_cells(row: PolicyCost, is_chosen: bool) -> tuple[str, ...]:
     """Return the cells of a policy's row in the table of costs, under the titles in `COLUMNS`.
 
-    The first is ">" if the policy is chosen, else "". The others are its rule, LB, cost with its
-    interval, late cost, share of verified parts, and wrong accepts and rejects with their shares.
+    The first is ">" if the policy is chosen, else "". The others are its rule (like "alpha 0.1"
+    under the guarantee local, else the name of the guarantee), LB ("-" under cost), cost with its
+    interval in a second line, late cost, share of verified parts, and wrong accepts and rejects
+    with the intervals of their shares.
     """
     policy = row.policy
     is_local = policy.guarantee == "local"

@@ -260,9 +260,9 @@ class DecisionModule(nn.Module):
     def predicted(self) -> int:
         """Return what the model alone would have done with the trace decided (or restored) last.
 
-        It is an `ActionCode` (0 verify, 1 accept, 2 reject), and 0 before the first decision. It
-        differs from the action in an audit, and if a force limit rejects. `learn` does not change
-        it.
+        It is an `ActionCode` (0 verify, 1 accept, 2 reject), 0 before the first decision and after
+        `decide` got a faulty trace. It differs from the action in an audit, and if a force limit
+        rejects. `learn` does not change it.
         """
         return self.last_predicted
 

@@ -296,8 +296,9 @@ class AddressSpace:
         """Write a status, as `RobotCalls.status` returns it, into the OPC UA variables.
 
         If the text of the alarm differs from that of the last call (before the first call: ""), an
-        event with the new text is sent. If the new text is empty, the event says that the alarm has
-        ended.
+        event with the new text is sent, of severity 700. If the new text is empty, the event says
+        that the old alarm has ended, with severity 100. Raises KeyError for a status that lacks a
+        value of `STATUS_NAMES`.
         """
         for name, key in STATUS_NAMES.items():
             node = self._node(name)

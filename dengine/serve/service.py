@@ -343,9 +343,10 @@ class CellService:
     async def call(self, work: Callable[[DataEngine], T], read_only: bool = False) -> T:
         """Call a function with the engine in the engine's thread, and return or raise what it does.
 
-        It waits in the queue, without a deadline. With `read_only` the function changes nothing,
-        and listeners to `changes` are not notified. Raises BusyError if the queue is full or the
-        service is closing; nothing is called then.
+        It waits in the queue, without a deadline; if the waiting is cancelled, the function is
+        called all the same. With `read_only` the function changes nothing, and listeners to
+        `changes` are not notified. Raises BusyError if the queue is full or the service is closing;
+        nothing is called then.
         """
         return await asyncio.wrap_future(self.submit(lambda engine, late: work(engine), read_only))
 
