@@ -169,8 +169,9 @@ def _save(
 ) -> Path | None:
     """Write the description if `--save` asks for it, and return its path; else None.
 
-    It replaces another one only with `--force`. Raises OutputError without it, and if the file
-    cannot be written.
+    It goes to `source.path`, and replaces another file there only with `--force`, which `context`
+    has. Raises OutputError for another file without `--force`, and if the file cannot be written.
+    Without `--save` nothing is written.
     """
     return description.save(source.path, bool(context.params.get("force"))) if save else None
 
@@ -179,7 +180,7 @@ def _trace_line(dataset: "Dataset", i: int) -> str:
     """Return a text on trace `i` of a data set: the file or row that it comes from, if known, its
     label, and its first three and last two samples.
 
-    Of several channels, these are the samples of the first.
+    Of several channels, these are the samples of the first. Samples have 4 significant digits.
     """
     trace = dataset.cube[i, 0]
     samples = [f"{value:.4g}" for value in (*trace[:3], *trace[-2:])]

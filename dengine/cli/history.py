@@ -51,9 +51,9 @@ class Moment(click.ParamType):  # type: ignore[type-arg]  # click made it generi
     ) -> float:
         """Return the time in seconds since 1970; a usage error for a text that is no time.
 
-        "30m" is 30 minutes before now (likewise s, h and d); otherwise the text is a date, with or
-        without a time, in ISO 8601, which is in UTC if it has no offset. A date alone is its
-        midnight.
+        "30m" is 30 minutes before now (likewise s, h and d, also with decimals); otherwise the text
+        is a date, with or without a time, in ISO 8601, which is in UTC if it has no offset. A date
+        alone is its midnight. Dates may lie in the future.
         """
         ago = re.fullmatch(r"(\d+(?:\.\d+)?)([smhd])", value)
         if ago:
@@ -142,7 +142,9 @@ def _label_text(stored: StoredDecision) -> str:
 
 
 def _model_text(stored: StoredDecision) -> str:
-    """Return what the model alone would have done, "" if that is what was done."""
+    """Return the action that the model alone would have taken, like "accept"; "" if that is the
+    action of the decision.
+    """
     predicted = stored.decision.predicted
     return "" if predicted is stored.decision.action else predicted.value
 
@@ -178,8 +180,9 @@ def _history_table(items: Sequence[StoredDecision | StoredVersion | Event]) -> s
     """Return a table of decisions as text, in the order of the items.
 
     It has a row for each decision, with the columns in `COLUMNS`, from its time to its label.
-    Retrains and events are lines between its rows, cut to 119 characters; the rows are not cut.
-    Without any item the text is a sentence that says so.
+    Retrains and events are lines between its rows, cut to 119 characters; the rows are not cut. Two
+    lines of titles come first, also if no item is a decision. Without any item the text is a
+    sentence that says so.
     """
     from ..store.records import StoredDecision
 
@@ -205,7 +208,9 @@ def _history_table(items: Sequence[StoredDecision | StoredVersion | Event]) -> s
 def _event_line(item: StoredVersion | Event) -> str:
     """Return the line of an event or a retrain: its time in UTC, what happened, and why.
 
-    The line of a retrain also has the number of traces and the duration.
+    The line of a retrain also has the number of traces and the duration; it names the version that
+    was put in force, or, if the retrain was dropped, the number of the retrain. The text of an
+    event is put on one line.
     """
     from ..store.records import Event
 

@@ -40,19 +40,27 @@ OWN_RECIPE = "FILE.toml|module:Class"
 
 
 def example_epilog(example: str) -> str:
-    """Return the end of a help text, which shows one command that works."""
+    """Return the end of a help text: a line "Example:", and below it the command `example`.
+
+    The control character at its start keeps click from joining the two lines.
+    """
     return f"\b\nExample:\n  {example}"
 
 
 def verb(example: str) -> Callable[[Command], click.Command]:
-    """Make a function a subcommand, with `--json` and a help that ends in an example."""
+    """Return a decorator that makes a function a subcommand, a `click.Command`.
+
+    It adds the flag `--json`, which the function does not get as an argument (see `as_json`). The
+    help is the function's docstring, the options, and at the end the command line `example`.
+    """
     return lambda command: click.command(epilog=example_epilog(example))(json_option(command))
 
 
 def names_of(kind: str) -> tuple[str, ...]:
     """Return the names that an option of this kind accepts, such as "wilson" for an interval.
 
-    The modules that define them are imported only when this is called.
+    They are in the order in which their modules list them. The modules that define them are
+    imported only when this is called.
 
     Parameters
     ----------
@@ -138,8 +146,8 @@ class CommaList(click.ParamType[Any]):
     ) -> tuple[Any, ...]:
         """Return the converted values as a tuple; a usage error if there is none or one is wrong.
 
-        White space around an item is removed, and empty items are left out. A tuple, such as a
-        default, is returned as it is.
+        White space around an item is removed, and empty items are left out; an item that comes
+        twice is kept twice. A tuple, such as a default, is returned as it is.
         """
         if isinstance(value, tuple):
             return value
@@ -152,6 +160,9 @@ class CommaList(click.ParamType[Any]):
 def bundle_options(into: str, make: Callable[..., Any], options: Mapping[str, Option]) -> Option:
     """Return a decorator that adds options and hands them to the subcommand as one argument.
 
+    The subcommand's other arguments reach it unchanged. The help lists the options in their order
+    here. What `make` raises is raised before the subcommand begins.
+
     Parameters
     ----------
     into : str
@@ -163,7 +174,7 @@ def bundle_options(into: str, make: Callable[..., Any], options: Mapping[str, Op
     """
 
     def decorate(command: Command) -> Command:
-        """Return the command with the options, and with one argument in their place."""
+        """Return the command with the options, and with one argument `into` in their place."""
 
         @wraps(command)
         def bundled(**values: Any) -> Any:
@@ -179,7 +190,10 @@ def bundle_options(into: str, make: Callable[..., Any], options: Mapping[str, Op
 
 
 def drop_none(**values: Any) -> dict[str, Any]:
-    """Return the options that were given, by name: those whose value is not None."""
+    """Return the options that were given, by name: those whose value is not None.
+
+    False, 0 and "" were given, too.
+    """
     return {name: value for name, value in values.items() if value is not None}
 
 
@@ -250,7 +264,10 @@ def store_option(text: str, *names: str, required: bool = False) -> Option:
 
 
 def short_name(name: str) -> str:
-    """Return a recipe's name for tables and files: folder/often.toml -> often, m:Class -> Class."""
+    """Return a recipe's name for tables and files: folder/often.toml -> often, m:Class -> Class.
+
+    A plain name, like conv, is returned as it is.
+    """
     return Path(name.rpartition(":")[2]).stem
 
 
@@ -422,7 +439,9 @@ class DataChoice:
 
     @property
     def path(self) -> Path:
-        """Where the description is saved."""
+        """Where the description is saved: the file that was given, else the default beside or in
+        the data (`saved_description`). It need not exist.
+        """
         from ..datasets.loading import saved_description
 
         return self.description or saved_description(self.data)
@@ -486,8 +505,9 @@ class DataChoice:
 def fault_lines(data: Dataset, most: int) -> list[str]:
     """Return lines that list the recordings of a data set that could not be read, with the reasons.
 
-    The first line counts them, at most `most` are named, and a last line counts the others. The
-    list is empty if every recording could be read.
+    The first line counts them and all recordings, those without a label included. At most `most`
+    are named, in their order, and a last line counts the others. The list is empty if every
+    recording could be read.
     """
     n_faults = len(data.faults)
     if not n_faults:
@@ -567,8 +587,10 @@ DATA = CHOICE | {
 def parse_stated(items: Iterable[str]) -> dict[str, Any]:
     """Return the values of `--set KEY=VALUE` by their keys, which stay texts like `label.column`.
 
-    A value is read as TOML; if it is not valid TOML, it is the text itself. If a key comes twice,
-    its last value counts. Raises click.UsageError for an item without `=`.
+    A value is read as TOML; if it is not valid TOML, it is the text itself. Only the first `=` of
+    an item divides it, and white space around the key is removed. If a key comes twice, its last
+    value counts. Whether there is such a key is not checked. Raises click.UsageError for an item
+    without `=`.
     """
     stated = dict[str, Any]()
     for item in items:
@@ -752,7 +774,9 @@ def out_option(
     """
 
     def make_out(out: Path | None, force: bool) -> Out | None:
-        """Return the `Out`, None without `--out`; OutputError if a file must not be written."""
+        """Return the `Out`, None without `--out`; OutputError if one of the files `names` must not
+        be written. Nothing is created.
+        """
         from ..files import check_output
 
         if out is None:

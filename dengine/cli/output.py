@@ -58,7 +58,7 @@ explain_option = _context_flag(EXPLAIN, "Explain the columns below the table.")
 
 def legend_or_hint(legend: str) -> str:
     """Return the legend of a table if the running subcommand was given `--explain`, else a line
-    that names that flag.
+    that names that flag. Raises RuntimeError if no subcommand runs.
     """
     if click.get_current_context().meta.get(EXPLAIN):
         return legend
@@ -196,6 +196,8 @@ def table_of_rows(
 ) -> "Table":
     """Return a rich Table whose first column is bold; passwords of database URLs are masked.
 
+    The first column is never wrapped; a cell of another column that is too wide is folded.
+
     Parameters
     ----------
     title : str
@@ -216,7 +218,11 @@ def table_of_rows(
 
 
 def table_of_records(title: str, records: Iterable[Any], *names: str) -> "Table":
-    """Return a rich Table with a row for each record and a column for each of the named fields."""
+    """Return a rich Table with a row for each record and a column for each of the named fields.
+
+    `heading` makes the titles of the columns, and `format_value` the cells. Without records it has
+    the titles only. Raises AttributeError for a field that a record lacks.
+    """
     rows = [[format_value(name, getattr(record, name)) for name in names] for record in records]
     return table_of_rows(title, rows, [heading(name) for name in names])
 
@@ -224,8 +230,9 @@ def table_of_records(title: str, records: Iterable[Any], *names: str) -> "Table"
 def field_rows(record: Any, *left_out: str) -> Iterator[tuple[str, str]]:
     """Yield (heading, formatted value) for each field of the dataclass `record`.
 
-    `heading` and `format_value` make both texts. Fields that are None or empty, and those named in
-    `left_out`, are skipped.
+    `heading` and `format_value` make both texts, in the order of the fields. Fields that are None
+    or empty (a text, list or mapping), and those named in `left_out`, are skipped; 0 and False are
+    not.
     """
     for field in fields(record):
         value = getattr(record, field.name)
@@ -235,7 +242,10 @@ def field_rows(record: Any, *left_out: str) -> Iterator[tuple[str, str]]:
 
 
 def heading(name: str) -> str:
-    """Return a field's name as people read it, without its unit: retrain_max_s -> retrain max."""
+    """Return a field's name as people read it, without its unit: retrain_max_s -> retrain max.
+
+    Units are `_s`, `_bytes` and `_hz` at the end; every other underscore becomes a space.
+    """
     return re.sub("_(s|bytes|hz)$", "", name).replace("_", " ")
 
 
@@ -299,12 +309,19 @@ def format_duration(seconds: float) -> str:
 
 
 def format_time(seconds: float | None, form: str = "%Y-%m-%d %H:%M:%S UTC") -> str:
-    """Return a time, given in seconds since 1970, in UTC; "-" for None."""
+    """Return a time, given in seconds since 1970, as text in UTC; "-" for None.
+
+    `form` is a format of `strftime`, by default the date and the time to the second, and "UTC". The
+    fraction of a second is cut off.
+    """
     return "-" if seconds is None else datetime.fromtimestamp(seconds, UTC).strftime(form)
 
 
 def format_size(n_bytes: float) -> str:
-    """Return a size as people write it: 812 bytes, 296.0 kB, 1.4 MB."""
+    """Return a size as people write it: 812 bytes, 296.0 kB, 1.4 MB.
+
+    A kB is 1,000 bytes. A fraction of a byte is cut off; from 1 kB on there is one decimal.
+    """
     from rich.filesize import decimal
 
     return decimal(int(n_bytes))
@@ -323,7 +340,11 @@ FORMATTERS: dict[str, Callable[[float], str]] = {
 
 
 def certificate_record(certificate: "Certificate") -> Record:
-    """Return a certificate as a dict for JSON: its numbers, its verdict and its sentences."""
+    """Return a certificate as a dict for JSON.
+
+    It has all its fields, `kept` (whether the bound on accepted parts lies within the tolerance),
+    and its sentences on accepted and on rejected parts, `sentence` and `sentence_on_rejects`.
+    """
     sentences = ("kept", "sentence", "sentence_on_rejects")
     return asdict(certificate) | {name: getattr(certificate, name) for name in sentences}
 
@@ -455,6 +476,8 @@ def interruptible_steps(label: str, total: int) -> Iterator[Callable[[int], None
 def exit_interrupted(*lines: str) -> NoReturn:
     """Print lines to stderr that say what was kept, and end the running subcommand, and so the
     process, with exit code 130; passwords are masked.
+
+    It raises click's `Exit`, and never returns. The lines are printed also with `--json`.
     """
     for line in lines:
         click.echo(without_password(line), err=True)

@@ -359,7 +359,10 @@ def _replay_and_print(
 def _group_replays(
     replays: Sequence[Replay], key: Callable[[Replay], str]
 ) -> dict[str, list[Replay]]:
-    """Return a dict: `key(replay)` -> the replays with this key, which follow each other."""
+    """Return a dict: `key(replay)` -> the replays with this key, in their order.
+
+    Replays with one key must follow each other; otherwise only those of the last group count.
+    """
     return {name: list(group) for name, group in groupby(replays, key)}
 
 
@@ -508,7 +511,7 @@ def costs(
 
     def play(tasks: Sequence[Task]) -> list[Replay]:
         """Play tasks with a progress bar; return the finished replays in the order of the tasks,
-        and keep what interrupted them in `error`.
+        and keep what interrupted them in `error`, None if nothing did.
         """
         nonlocal error
         played, error = _play(dataset, tasks, stream)
@@ -590,7 +593,8 @@ def _curve_lines(curve: CostCurve, dataset: Dataset) -> list[str]:
 def _as_flags(settings: Options) -> str:
     """Return settings of a policy, given by name, as options of the command line in one text.
 
-    It is like "--alpha 0.1 --lower-bound 0.9"; the prices are joined by commas.
+    It is like "--alpha 0.1 --lower-bound 0.9", in the order of the settings; the prices are joined
+    by commas. Without settings it is "".
     """
     texts = {
         name: ",".join(f"{price:g}" for price in value) if name == "prices" else str(value)
@@ -602,8 +606,10 @@ def _as_flags(settings: Options) -> str:
 def _cost_cells(row: PolicyCost, is_chosen: bool) -> tuple[str, ...]:
     """Return the cells of a policy's row in the table of costs, under the titles in `COLUMNS`.
 
-    The first is ">" if the policy is chosen, else "". The others are its rule, LB, cost with its
-    interval, late cost, share of verified parts, and wrong accepts and rejects with their shares.
+    The first is ">" if the policy is chosen, else "". The others are its rule (like "alpha 0.1"
+    under the guarantee local, else the name of the guarantee), LB ("-" under cost), cost with its
+    interval in a second line, late cost, share of verified parts, and wrong accepts and rejects
+    with the intervals of their shares.
     """
     policy = row.policy
     is_local = policy.guarantee == "local"
@@ -621,9 +627,9 @@ def _cost_cells(row: PolicyCost, is_chosen: bool) -> tuple[str, ...]:
 
 def _error_cell(error: ErrorRate) -> str:
     """Return how many decisions were wrong, like "3 of 120", and in a second line the interval of
-    their share in percent.
+    their share in percent, like "0.5 to 7.1 %".
 
-    It is "-" if there was no decision.
+    The ends have two significant digits. It is "-" if there was no decision.
     """
     if not error.decided:
         return "-"

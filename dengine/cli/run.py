@@ -204,11 +204,12 @@ def _safe_mode_line(change: Record) -> str:
 def _simulated_cell(scenario: str, cycles: int, source: DataChoice, **others: Any) -> CellToDrive:
     """Return the `TraceSpec` of the simulated cell, and a function that makes the cell.
 
-    The `TraceSpec` has what the options of `source` state; the rest is the simulation's own. The
+    The `TraceSpec` is the simulation's own, or what the options of `source` state; rate, unit and
+    names of channels that these leave out are then the simulation's, if the shape is the same. The
     cell's seed depends on the number of decisions in the store, and in a product also on the cell,
     so that no part comes twice. `scenario` says what changes in the course of the `cycles`; for an
     unknown one SettingError is raised when the cell is made. `others` are settings of other kinds
-    of cell, and are ignored.
+    of cell, and are ignored. Raises what `trace_spec_from` raises.
     """
     from ..cells.simulation.cell import SimulatedCell
 
@@ -247,8 +248,8 @@ def _replay_cell(source: DataChoice, cycles: int, **others: Any) -> CellToDrive:
     dataset = source.load()
 
     def make(engine: DataEngine) -> tuple[Cell, str]:
-        """Return the rest of the recording as a cell, and its name; SettingError if too few parts
-        are left.
+        """Return the parts after the last one that this engine's store knows as a cell, and its
+        name; SettingError if fewer than `cycles` are left.
         """
         store = engine.store
         # By the content of the traces: the store's own hash is one number for a part that comes
@@ -278,6 +279,7 @@ def _robot_cell(source: DataChoice, host: str | None, **others: Any) -> CellToDr
 
     The robot is a Universal Robots controller at `host`, HOST or HOST:PORT. The options of `source`
     say what is recorded, and when; `others` are settings of other kinds of cell, and are ignored.
+    Nothing is connected before the function is called. The cell's `close` ends the connection.
 
     Raises
     ------
@@ -302,6 +304,8 @@ def _robot_cell(source: DataChoice, host: str | None, **others: Any) -> CellToDr
 
 def host_and_port(address: str) -> tuple[str, int]:
     """Split HOST[:PORT] of a robot controller, and return both; without PORT it is 30004, RTDE's.
+
+    HOST may come back empty, for an `address` without one.
 
     Raises
     ------
@@ -397,8 +401,9 @@ def _print_run(replay: Replay, record: Record, cell: Any, out: Out | None) -> No
 def _stretch_cells(stretch: Mapping[str, Any], total: Mapping[str, Any]) -> dict[str, str]:
     """Return a table row, title -> cell, for the counts of a stretch of cycles.
 
-    `stretch` and `total`, the counts of the whole run, are as `Replay.stretch` returns them. Parts
-    outside the force limits have no column if there were none in the whole run.
+    `stretch` and `total`, the counts of the whole run, are as `Replay.stretch` returns them. The
+    cells are its first and last cycle, the share of verified parts in whole percent, and the counts
+    in `COLUMNS`. Parts outside the force limits have no column if there were none in the whole run.
     """
     cells = {
         "cycles": f"{stretch['first_cycle']} to {stretch['last_cycle']}",

@@ -151,9 +151,10 @@ def _present_rows(report: "Status") -> list[tuple[str, str]]:
 
 
 def _without_audits(counts: dict[str, int]) -> dict[str, int]:
-    """Return counts with the key "audit" renamed to "certain but checked".
+    """Return counts with the key "audit" renamed to "certain but checked", in a new dict.
 
-    For a policy without audits: what has that reason was verified in shadow mode.
+    For a policy without audits: what has that reason was verified in shadow mode. Without that key
+    the counts are the same.
     """
     return {TITLES["audits"] if name == "audit" else name: n for name, n in counts.items()}
 
@@ -162,8 +163,8 @@ def _span_cell(name: str, span: "Span") -> str:
     """Return the text of a field of a `Span`: a time, a number, or a share of wrong decisions with
     its verdict.
 
-    A `Span` has the counts over the newest decisions, or over all, and `name` names its field. A
-    few words replace the share if there is none, because no part was accepted.
+    A `Span` has the counts over the newest decisions, or over all, and `name` names its field.
+    "none was accepted" replaces the share of bad accepted parts if no part was accepted.
     """
     value = getattr(span, name)
     if name in ("first", "last"):

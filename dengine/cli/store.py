@@ -60,9 +60,11 @@ label_argument = click.argument("label", metavar="good|bad", type=click.Choice(l
 
 
 def store_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add STORE, `--author` and `--allow-import`, for a subcommand that changes an engine.
+    """Add STORE, `--cell`, `--author` and `--allow-import`, for a subcommand that changes an
+    engine.
 
-    Returns the command with these options; STORE reaches it as an address.
+    Returns the command with these options; STORE and the cell reach it as one address, `store`. The
+    author is the login name if none is given, or "" if the system has none.
     """
     return options.store_argument(options.allow_import_option(author_option(command)))
 
@@ -75,9 +77,9 @@ def _change_and_print(
     `change` returns a `Changed`, whose text is printed after the engine was closed, with the number
     of the event; the text may say that nothing changed. With `--json` a document is printed
     instead, which also has the policy and the certificate after the change. `allow_import` permits
-    to import the reducer or rule, module:Class, that the store names. Raises the errors of
-    `DataEngine.open` (StoreError if an engine runs on the cell), those of `certificate`, and
-    whatever `change` raises.
+    to import the reducer or rule, module:Class, that the store names. The engine waits up to 10 s
+    for the disk or database. Raises the errors of `DataEngine.open` (StoreError if an engine runs
+    on the cell), those of `certificate`, and whatever `change` raises; nothing is printed then.
     """
     from ..engine.engine import DataEngine
     from ..store.opening import LONG_WAIT
@@ -115,7 +117,9 @@ def report(part: str, label: str, **changing: Any) -> None:
     from ..history.explain import find_decision_id
 
     def change(engine: DataEngine, author: str) -> Changed:
-        """Report the label and record an event; report nothing if the decision has that label."""
+        """Report the label and record an event; if the decision has that label already, do nothing,
+        and return a `Changed` without an event that says so.
+        """
         id_ = find_decision_id(engine.store, part)
         stored = engine.find(id_)
         if stored is not None and stored.success is LABELS[label]:

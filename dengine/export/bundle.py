@@ -57,6 +57,8 @@ Metadata = dict[str, Any]  # what an exported file says of itself, by name
 def make_key(path: FilePath) -> Path:
     """Write a new random key, 64 hexadecimal digits, to a new file that only its owner can read.
 
+    A line break follows the key, and the file is flushed to the disk. Its folder must exist.
+
     Returns
     -------
     Path
@@ -83,7 +85,8 @@ def make_key(path: FilePath) -> Path:
 def signature(content: bytes, key: FilePath) -> str:
     """Return the signature of a content with the secret in a key's file: "hmac-sha256:HEX".
 
-    Raises ExportError for a file that cannot be read or is too short to be a key.
+    Line breaks at the end of the file do not belong to the secret. Raises ExportError for a file
+    that cannot be read, or whose secret has less than 16 bytes.
     """
     secret = read_key(key, ExportError)
     return PREFIX + hmac.new(secret, content, hashlib.sha256).hexdigest()
@@ -92,7 +95,7 @@ def signature(content: bytes, key: FilePath) -> str:
 def sibling_path(path: FilePath, suffix: str) -> Path:
     """Return the path of a file's checksum (sha256), signature (sig) or head (head), PATH.SUFFIX.
 
-    `sha256sum --check` reads the first.
+    The suffix is appended: model.ts gets model.ts.sha256. No file is looked at.
     """
     return Path(f"{os.fspath(path)}.{suffix}")
 
@@ -265,9 +268,10 @@ def write_export(
 ) -> Path:
     """Write a file, its checksum (PATH.sha256) and, with a key, its signature (PATH.sig).
 
-    Each file is put in place by a rename. If the process is killed between two renames, the file
-    may be refused as damaged until it is exported again. Before anything is written, the export is
-    recorded as an event of the engine, so the event may be there without the file.
+    The folder must exist. Each file is put in place by a rename. If the process is killed between
+    two renames, the file may be refused as damaged until it is exported again. Before anything is
+    written, the export is recorded as an event of the engine, so the event may be there without the
+    file.
 
     Parameters
     ----------
@@ -316,7 +320,10 @@ def write_export(
 
 
 def _check_outputs(path: FilePath, force: bool) -> None:
-    """Raise OutputError unless the file, its checksum and its signature may be written."""
+    """Raise OutputError unless the file, its checksum and its signature may be written.
+
+    With `force` they may replace files. The signature is checked even if there is no key.
+    """
     for file in (Path(path), sibling_path(path, "sha256"), sibling_path(path, "sig")):
         check_output(file, force)
 
@@ -357,7 +364,9 @@ def read_checked(path: Path, key: FilePath | None = None) -> bytes:
 
 
 def _first_word(content: bytes) -> str:
-    """Return the sum or the signature at the start of a line, "" of an empty one."""
+    """Return the text before the first space of a file's content, a sum or a signature; "" if it
+    begins with a space or is empty. Bytes that are not UTF-8 are replaced, and nothing is raised.
+    """
     return content.decode("utf-8", errors="replace").partition(" ")[0].strip()
 
 
@@ -375,8 +384,9 @@ def _read(path: Path, most: int = -1) -> bytes:
 def metadata_of(content: bytes, path: Path) -> Metadata:
     """Return the description inside the content of a TorchScript file, a zip archive.
 
-    No code of the file is run. Raises ExportError, which names `path`, if there is no description
-    in it, or one with another schema (version of its keys).
+    No code of the file is run, and `path` is not read. Raises ExportError, which names `path`, if
+    the content is no such archive, or has no description that can be read, or one with another
+    schema (version of its keys).
     """
     with (
         instead(

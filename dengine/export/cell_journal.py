@@ -48,13 +48,14 @@ class JournalLine:
     Attributes
     ----------
     decision : Decision
+        Without what a journal lacks: the embedding is None, the model version 0, the propensity 1.
     trace : array of float32, shape (C, T)
-        Empty for a rejected part.
+        Empty for a rejected part, shape (1, 0).
     label : bool or None
-        None if no outcome was reported.
+        True good, False bad; None if no outcome was reported.
     late : bool
-        Whether the label came after the next part was decided. An accepted part then has a line of
-        its own before it.
+        Whether the label came after the next part was decided. An accepted part then also has an
+        earlier JournalLine, without the label.
     """
 
     decision: Decision
@@ -115,8 +116,8 @@ def read_journal(path: FilePath, spec: TraceSpec) -> CellJournal:
     ------
     DataError
         For a file that is no journal of format 4, the present one (`FORM`), a line whose checksum
-        fits but which cannot be read as `spec` says, or a journal with neither an accepted nor a
-        labelled part.
+        fits but which cannot be read as `spec` says or has the label of a part without a line, or a
+        journal with neither an accepted nor a labelled part.
     OSError
         If the file cannot be read.
     """
@@ -236,9 +237,11 @@ def import_journal(store: "StoreLike", path: FilePath, any_model: bool = False) 
 
     A part that was imported before is not imported again, but its label is, if it has none yet; a
     label that contradicts the stored one is only counted. A part whose trace has a fault is
-    quarantined. The decision rule and the certificate count imported parts like the engine's own.
-    If a line is missing or was changed, only the lines before it are imported. A store that was
-    passed open stays open; on PostgreSQL it owns the cell until it is closed.
+    quarantined. New rows have the time of the import. The decision rule and the certificate count
+    imported parts like the engine's own. Under `stops="all"` an accepted part without a report is
+    imported as good, unless it is the journal's last part. If a line is missing or was changed,
+    only the lines before it are imported. A store that was passed open stays open; on PostgreSQL it
+    owns the cell until it is closed.
 
     Parameters
     ----------

@@ -72,7 +72,8 @@ class DecisionModule(nn.Module):
     last_predicted : int
         What the model alone would have done with the trace decided last.
     n_unreported : int
-        Number of accepted parts since the last label; their outcomes stay unknown.
+        Number of accepted parts since the last label whose outcome was not reported, without the
+        pending one; always 0 with `stops_all`.
     """
 
     pending: DecidedTrace | None
@@ -118,9 +119,9 @@ class DecisionModule(nn.Module):
         action, reason : int
             Positions in `Action` and `Reason`.
         lower, upper : float
-            Bound on the success probability.
+            Bound on the success probability; (0, 1) for a faulty trace or if a force limit decides.
         n_success, n_failure : int
-            Labels within the radius.
+            Labels within the radius; 0 for a faulty trace, or if a force limit decides.
         embedding : Tensor of float32, shape (K, d)
             NaN for a faulty trace, which is verified.
 
@@ -143,7 +144,7 @@ class DecisionModule(nn.Module):
         return action, reason, lower, upper, n_success, n_failure, z
 
     def forward(self, trace: Tensor, part: int = 0) -> DecisionFields:
-        """Call `decide`, by the name under which `torch.jit.load` calls a module."""
+        """Do and return what `decide` does; a loaded module that is called runs this method."""
         return self.decide(trace, part)
 
     @torch.jit.export
@@ -152,10 +153,10 @@ class DecisionModule(nn.Module):
 
         If the trace and its part are those of the pending decision, its bound is used, and no
         decision is pending afterwards. Otherwise the trace is first decided on, because a bound
-        must be computed before the label is known; the pending decision then stays pending. A
-        faulty trace is ignored. If the index is full, its oldest reference is dropped. The rule
-        also learns how many accepts were unreported since the last label, and this count restarts
-        at 0.
+        must be computed before the label is known; the pending decision then stays pending, and is
+        not settled. A faulty trace is ignored: nothing changes. If the index is full, its oldest
+        reference is dropped. The rule also learns how many accepts were unreported since the last
+        label, and this count restarts at 0.
 
         Parameters
         ----------
@@ -193,9 +194,10 @@ class DecisionModule(nn.Module):
 
     @torch.jit.export
     def stop(self, trace: Tensor, part: int = 0) -> int:
-        """Learn that an accepted part was bad and stopped the line, as `learn` does.
+        """Learn that an accepted part was bad and stopped the line: `learn` with the label bad.
 
-        Whether it was accepted is not checked.
+        Whether it was accepted is not checked. Returns the number of references, and raises what
+        `learn` raises.
         """
         return self.learn(trace, False, part)
 
@@ -221,7 +223,11 @@ class DecisionModule(nn.Module):
 
     @torch.jit.export
     def drop(self) -> None:
-        """Discard the pending decision: its part was not passed on, its outcome stays unknown."""
+        """Discard the pending decision: its part was not passed on, its outcome stays unknown.
+
+        Nothing is learned, and an accept does not count as unreported. Without a pending decision
+        nothing changes.
+        """
         self.pending = None
 
     @torch.jit.export
@@ -252,21 +258,25 @@ class DecisionModule(nn.Module):
 
     @torch.jit.export
     def predicted(self) -> int:
-        """Return what the model alone would have done with the trace decided last.
+        """Return what the model alone would have done with the trace decided (or restored) last.
 
-        It differs from the action in an audit, and if a force limit rejects.
+        It is an `ActionCode` (0 verify, 1 accept, 2 reject), 0 before the first decision and after
+        `decide` got a faulty trace. It differs from the action in an audit, and if a force limit
+        rejects. `learn` does not change it.
         """
         return self.last_predicted
 
     @torch.jit.export
     def safe_mode(self) -> int:
-        """Return why the safe mode began, as a `SafeMode`; NONE outside of a safe mode."""
+        """Return why the safe mode began, as the integer of a `SafeMode`; 0 (NONE) outside of a
+        safe mode.
+        """
         safe_mode: int = self.decider.predictor.neighbours.rule.safe_mode()
         return safe_mode
 
     @torch.jit.export
     def n_references(self) -> int:
-        """Return the number of references."""
+        """Return the number of references, the labelled points in all embedding spaces together."""
         n_references: int = self.decider.predictor.neighbours.references.size()
         return n_references
 
@@ -277,9 +287,9 @@ class DecisionModule(nn.Module):
         hash of the part (of the content of its trace, if the part is unknown) gives the part's fold
         k, and the reference is put into embedding space k. The rule gets as inclusion probability
         the audit rate if the part was audited, 1 if it was verified for another reason, and 0 if it
-        was accepted or rejected. It also gets `n_unreported`, the number of accepted parts without
-        a report since the last label, which restarts at 0. If the index is full, its oldest
-        reference is dropped.
+        was accepted or rejected. It also gets whether the trace was novel, and `n_unreported`, the
+        number of accepted parts without a report since the last label, which restarts at 0. If the
+        index is full, its oldest reference is dropped. `pending` is not changed.
         """
         inclusion_probability = 0.0
         if decided.action == ActionCode.VERIFY.value:
@@ -298,9 +308,10 @@ class DecisionModule(nn.Module):
     def as_trace(self, trace: Tensor) -> Tensor:
         """Return a trace (T,) or (C, T) as (C, T) float32 with the samples that the decider takes.
 
-        Another number of samples is cut, padded or resampled, as `TraceSpec.fit` says. Raises
-        ValueError, or torch.jit.Error if compiled, for a number of samples that cannot be fitted in
-        this way, for no samples, and for another shape.
+        Another number of samples is cut, padded or resampled, as `TraceSpec.fit` says. A trace that
+        has the right shape and dtype already, and is contiguous, is not copied. NaN and infinities
+        pass. Raises ValueError, or torch.jit.Error if compiled, for a number of samples that cannot
+        be fitted in this way, for no samples, and for another shape.
         """
         x = trace.unsqueeze(0) if trace.dim() == 1 else trace
         fits = x.numel() > 0 and can_fit_length(x.size(-1), self.samples, self.fit)

@@ -165,7 +165,8 @@ def _refuse_unsupported(source: Exportable) -> None:
     """Raise ExportError if the decision needs something that ONNX cannot carry, and name it all.
 
     That is an audit rate above 0, a decision rule other than that of the guarantee "local" with
-    stops "some", a part that is among the references more than once, and force limits.
+    stops "some" (also a user's own rule), a part that is among the references more than once, and
+    force limits. Otherwise nothing happens.
     """
     rule = type(source.model.rule)  # a user's own as well: `OnnxDecision` knows the paper's alone
     n_repeats = int(source.model.index.repeats)
@@ -216,10 +217,11 @@ class OnnxModel:
     def decide(self, trace: ArrayLike) -> ExportedDecision:
         """Decide on one trace, (T,) or (C, T), and keep nothing of it.
 
-        Returns action, reason, lower, upper, n_success, n_failure and embedding. Another T is cut,
-        padded or resampled, or refused, as `TraceSpec.fit` says. A faulty trace, or a novel one,
-        which is unlike all traces of the training, is verified, and its reason says so. Raises
-        TraceError for a wrong shape, and for values that are no real numbers.
+        Returns action, reason, lower, upper, n_success, n_failure and embedding (K, d). Another T
+        is cut, padded or resampled, or refused, as `TraceSpec.fit` says. A faulty trace, or a novel
+        one, which is unlike all traces of the training, is verified, with the bound (0, 1) and no
+        labels, and its reason says so; the embedding of a faulty trace is NaN. Raises TraceError
+        for a wrong shape, and for values that are no real numbers.
         """
         outputs = self.session.run(None, {"trace": as_trace(trace, self.trace)})
         action, reason, *counted, z = outputs
@@ -229,6 +231,8 @@ class OnnxModel:
 
 class OnnxDecision(nn.Module):
     """The decision without a branch, in tensors; the references do not change.
+
+    It has a copy of the model's references.
 
     Parameters
     ----------
@@ -302,8 +306,9 @@ class OnnxDecision(nn.Module):
         """Count the labels within the radius; return action, lower, upper, n_success, n_failure.
 
         `distances` are the squared distances to the references, (n,). The results are tensors
-        without a dimension. The action, 0 verify, 1 accept or 2 reject, follows from the bound
-        (`lower`, `upper`) by the paper's rule. A reference at the radius counts.
+        without a dimension. The action follows from the bound (`lower`, `upper`) by the paper's
+        rule: 1 accept if lower reaches the rule's accept threshold, else 2 reject if upper is at
+        most its reject threshold, else 0 verify. A reference at the radius counts.
         """
         is_inside = distances <= self.radius * self.radius
         n_success = (is_inside & (self.labels == 1)).sum()
@@ -368,7 +373,9 @@ def _check_decisions(onnx_model: OnnxModel, model: Any, spec: TraceSpec) -> None
 
 
 def _require_packages() -> None:
-    """Raise ExportError, with what to install, if a package for ONNX is missing."""
+    """Raise ExportError, with what to install, if a package for ONNX is missing: onnx, onnxruntime
+    or onnxscript. None of them is imported.
+    """
     missing = [needed for needed in NEEDED if find_spec(needed) is None]
     if missing:
         raise ExportError(f"ONNX needs {', '.join(missing)}; pip install dengine[onnx].")

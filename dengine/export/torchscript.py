@@ -146,7 +146,7 @@ def export_torchscript(
 
 
 def _content(module: Any, metadata: Metadata) -> bytes:
-    """Return the bytes of a file with this module and description.
+    """Return the bytes of a TorchScript file with this compiled module and description, as JSON.
 
     They are made in memory because libtorch ends the whole process if a disk is full.
     """
@@ -158,7 +158,8 @@ def _content(module: Any, metadata: Metadata) -> bytes:
 def golden_trace(spec: TraceSpec) -> TraceArray:
     """Return the trace, float32 (C, T), on which a loader checks the embedding of its machine.
 
-    It is a sine, always the same for the same `spec`, within half of the sensor's limit.
+    It is a sine that runs on from channel to channel, always the same for the same `spec`. Its
+    amplitude is half of the sensor's limit, or 1 without a limit.
     """
     n = spec.channels * spec.samples
     x = np.sin(np.arange(n, dtype=np.float32) / 7.0).reshape(spec.channels, spec.samples)
@@ -171,8 +172,10 @@ class ExportedDecision(NamedTuple):
     Attributes
     ----------
     action, reason, lower, upper, n_success, n_failure
-        As of `Decision`.
+        Like those of `Decision`: what to do and why, the bound of the success probability, and the
+        good and bad labels within the radius; the bound is (0, 1) without a prediction.
     embedding : array of float32, shape (K, d)
+        A point in each embedding space; NaN for a faulty trace.
     """
 
     action: Action
@@ -239,10 +242,11 @@ class ExportedModel:
     def learn(self, trace: ArrayLike, success: bool, part: PartNumber = None) -> int:
         """Learn the outcome of a part, after its `decide` and before the next.
 
-        The trace becomes a reference, the decision rule is updated, and `metadata["references"]`
-        becomes the new number of references. The file on the disk is not changed; see `save`. A
-        faulty trace is ignored. If the trace or the part is not that of the pending decision, the
-        model first decides on the trace, and the earlier decision stays pending.
+        The trace becomes a reference (the oldest is dropped if there is no room), the decision rule
+        is updated, and `metadata["references"]` becomes the new number of references. The file on
+        the disk is not changed; see `save`. A faulty trace is ignored. If the trace and the part
+        are those of the pending decision, nothing is pending afterwards; otherwise the model first
+        decides on the trace, and the earlier decision stays pending.
 
         Parameters
         ----------
@@ -273,15 +277,16 @@ class ExportedModel:
         return n_references
 
     def stop(self, trace: ArrayLike, part: PartNumber = None) -> int:
-        """Learn that an accepted part was bad and stopped the line, as `learn` does.
+        """Learn that an accepted part was bad and stopped the line: `learn` with the label bad.
 
-        Whether it was accepted is not checked.
+        Whether it was accepted is not checked. Returns the number of references, and raises
+        TraceError like `learn`.
         """
         return self.learn(trace, False, part)
 
     @property
     def safe_mode(self) -> str:
-        """Why the safe mode began, in words; "" outside of a safe mode."""
+        """Why the safe mode began, in words (`SAFE_MODES`); "" outside of a safe mode."""
         return SAFE_MODES[self.module.safe_mode()]
 
     def save(self, path: FilePath, *, key: FilePath | None = None, force: bool = False) -> Path:
@@ -298,7 +303,11 @@ class ExportedModel:
 
 
 def _part_hash(part: Any) -> int:
-    """Return the hash of a part's number, 0 for None; TraceError as `ExportedModel.decide`."""
+    """Return the hash of a part's number, 0 for None; 7 and "7" have the same hash.
+
+    Raises TraceError for anything but None, a whole number, and a text of 1 to 200 printable
+    characters.
+    """
     number = as_part(part)
     return 0 if number is None else part_hash(number)
 

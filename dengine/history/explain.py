@@ -183,8 +183,9 @@ def explain(store: SqlStore, decision_id: str, neighbours: int = 10) -> Explanat
         For a store that no engine has used, for a stored recipe that lacks settings, for a damaged
         `TraceSpec`, and for a damaged trace of the decision or of a neighbour.
     SettingError
-        For a stored recipe or policy that cannot be read, and if an object of the user's class of
-        rule cannot be made.
+        For a stored recipe or policy that cannot be read, if an object of the user's class of rule
+        cannot be made, and for a part outside the force limits if one of them does not fit its
+        trace.
     """
     settings = store.settings.read()
     if "recipe" not in settings:

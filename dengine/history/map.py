@@ -134,5 +134,5 @@ def part_map(store: "SqlStore", recipe: Recipe, version: int) -> PartMap:
 
 
 def _first_two(point: np.ndarray) -> tuple[float, float]:
-    """Return the first two dimensions of a point (d,); 0.0 for a second that it does not have."""
+    """Return the first two dimensions of a point, shape (d,); the second is 0.0 if d is 1."""
     return float(point[0]), float(point[1]) if len(point) > 1 else 0.0

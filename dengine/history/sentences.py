@@ -80,7 +80,9 @@ class Circumstances:
 
     @property
     def baseline(self) -> str:
-        """Name of a handed-in model that decides by its own method; "" for any other model."""
+        """Name of a handed-in model whose thresholds are not known, which is taken to decide by its
+        own method; "" for any other model.
+        """
         return self.model if self.model is not None and self.thresholds is None else ""
 
 

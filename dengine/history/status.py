@@ -326,7 +326,8 @@ class Status:
 def retrain_fault(dropped: Sequence[str], version: int) -> str:
     """Return an alarm in words if the last 3 or more retrains were dropped, else "".
 
-    It has the reason of the last one.
+    It has the reason of the last one, and says if there is no version yet, so that nothing is
+    decided without a check.
 
     Parameters
     ----------
@@ -527,7 +528,7 @@ def _estimate_error(
 def _verdict(lower: float, upper: float, tolerance: float) -> str:
     """Return "kept" if the interval is below the tolerance, "broken" if above, else "open".
 
-    An upper end equal to the tolerance is below it.
+    An upper end equal to the tolerance is below it; a lower end equal to it is not above it.
     """
     if upper <= tolerance:
         return "kept"
@@ -745,9 +746,10 @@ def as_frame(decisions: Iterable[StoredDecision]) -> pd.DataFrame:
     Returns
     -------
     pandas.DataFrame
-        A row for each decision, indexed by its id. The columns are the other fields of `Decision`
-        without the embedding, `time` in UTC, and `label`, which is "good", "bad" or None, if there
-        is none or it was forgotten. Actions and reasons are texts.
+        A row for each decision, indexed by its id; without decisions it has these columns and no
+        row. The columns are the other fields of `Decision` without the embedding, `time` in UTC,
+        and `label`, which is "good", "bad" or None, if there is none or it was forgotten; a
+        corrected label is shown as corrected. Actions and reasons are texts.
     """
     import pandas as pd
 

@@ -73,7 +73,11 @@ LARGE_SHARE = 0.025
 
 
 def field_types(record: type, *without: str) -> Json:
-    """Return the types of a record's fields by name, except those of the names in `without`."""
+    """Return the types of a record's fields by name, except those of the names in `without`.
+
+    The types are the annotations of the class, evaluated and without `Annotated`, in the order of
+    the fields. A name in `without` that is no field has no effect.
+    """
     hints = get_type_hints(record)
     return {name: hint for name, hint in hints.items() if name not in without}
 
@@ -82,10 +86,11 @@ def _request_type(handler: Callable[..., Any], optional_fields: Json) -> type[St
     """Return a msgspec struct type, into which a request is decoded.
 
     It has a field for each parameter of the handler (the method that answers the request), except a
-    `**` parameter. A parameter with a default may be left out of a request. The `optional_fields`,
-    given as types by name, may be left out too, and are UNSET then. Decoding refuses unknown
-    fields. Underscores at the end of a parameter's name are left out in a request: `id_` is `id`
-    there. The type gets the handler's docstring.
+    `**` parameter. A parameter with a default may be left out of a request, and has its default
+    then. The `optional_fields`, given as types by name, may be left out too, and are UNSET then.
+    Decoding refuses unknown fields. Underscores at the end of a parameter's name are left out in a
+    request: `id_` is `id` there. The type gets the handler's docstring, and as name the handler's,
+    with a capital, and `Request` behind it.
     """
     hints = get_type_hints(handler, include_extras=True)
     members: list[tuple[Any, ...]] = []
@@ -115,10 +120,11 @@ def media_type(request: Request) -> str:
 async def read_body(request: Request, struct_type: type[T]) -> T:
     """Decode a request's JSON body into a struct of `struct_type`, and return the struct.
 
-    The body is an object without nested objects. Raises HTTPException: 400 for a body that is no
-    JSON or has a name twice, 422 for fields that the type does not take. Raises ClientDisconnect if
-    the client goes away before the whole body has come, and HTTPException 413 while it is read, if
-    `Guard` finds it too large.
+    The body must be an object without nested objects; the media type is not checked. Raises
+    HTTPException: 400 for a body that is no JSON or has a name twice, 422 for a missing field, an
+    unknown one, and a value that the type does not take. Raises ClientDisconnect if the client goes
+    away before the whole body has come, and HTTPException 413 while it is read, if `Guard` finds it
+    too large.
     """
     body = await request.body()
     try:
@@ -141,8 +147,9 @@ def read_query(request: Request, struct_type: type[T], **body: bytes) -> T:
     """Convert the query of a request and the parameters in its path to a struct of `struct_type`.
 
     If the body is bytes, `body` has these bytes under the name of the field that gets them. Texts
-    are converted to the types of the fields. Raises HTTPException 422 for an unknown name, a name
-    that comes twice, a missing field and a wrong value.
+    are converted to the types of the fields, like "1" or "true" to True. Raises HTTPException 422
+    for an unknown name, a name that comes twice (also once in the query and once in the path or in
+    `body`), a missing field and a wrong value.
     """
     pairs = [*request.query_params.multi_items(), *request.path_params.items(), *body.items()]
     try:
@@ -163,7 +170,7 @@ def as_samples(value: Any, channels: int = 1) -> TraceArray:
         each channel. None becomes NaN, and a number beyond float32 infinity; for the engine both
         are faults of the trace.
     channels : int
-        Number of channels in bytes; lists do not need it.
+        Number of channels in bytes, 1 or more; it has no effect on lists.
 
     Returns
     -------
@@ -174,8 +181,9 @@ def as_samples(value: Any, channels: int = 1) -> TraceArray:
     Raises
     ------
     TraceError
-        For a value of another type, lists of unequal length, no samples, bytes that are not the
-        same whole number of samples for each channel, and bytes that look like float64.
+        For a value of another type (also a NumPy array), lists of unequal length, no samples, bytes
+        that are not the same whole number of samples for each channel, and bytes that look like
+        float64.
     """
     if isinstance(value, bytes):
         if len(value) % (4 * channels):
@@ -232,8 +240,8 @@ def _response_type(
 
     It has the fields of the dataclass `record`, if one is given, except those in `without`, with
     their types in JSON. It also has the fields of `more`, given as types by name; they replace
-    fields of the record with the same name. Its docstring is `about`, followed by the docstring of
-    the record.
+    fields of the record with the same name. No field has a default. Its docstring is `about`,
+    followed by the docstring of the record.
     """
     members = _json_field_types(record) if record else {}
     types = {key: hint for key, hint in members.items() if key not in without}
@@ -276,12 +284,12 @@ def _json_type(hint: Any) -> Any:
 
 
 def _described(hint: Any, text: str) -> Any:
-    """Return a type with a description for the OpenAPI document."""
+    """Return the type `hint`, annotated with `text`, its description in the OpenAPI document."""
     return Annotated[hint, Meta(description=text)]
 
 
 class Health(Struct):
-    """Whether the engine answers."""
+    """Whether the engine answers, and what is wrong with it: the response of /healthz."""
 
     status: Literal["ok", "degraded", "down"]
     store_fault: Annotated[str, Meta(description="Why the store cannot be written, or empty.")]
@@ -389,7 +397,8 @@ def response_fields(name: str, record: object = None, **more: Any) -> Json:
     """Return a dict for JSON with the fields of the response type that `RESPONSES` has by `name`.
 
     A value comes from `more`, as it is, else from the record, as `to_jsonable` converts it; fields
-    without a value, and values without a field, are left out.
+    without a value, and values without a field, are left out. The order is that of the fields of
+    the response type. Raises KeyError for a name that `RESPONSES` does not have.
     """
     values = (to_jsonable(record) or {}) | more
     return {key: values[key] for key in RESPONSES[name].__struct_fields__ if key in values}
@@ -412,9 +421,10 @@ def problem_response(
 ) -> Response:
     """Return the response to a request that is not served, in JSON with the fields of `Problem`.
 
-    These are the status, its title, the detail, and the action "verify". The detail is put on one
-    line, and passwords of URLs in it are masked. `headers` are added to the response; with status
-    503 it also has the header Retry-After, with 1 second.
+    These are the status, its title, the detail, the action "verify" and the type "about:blank". The
+    detail is put on one line, and passwords of URLs in it are masked. `headers` are added to the
+    response; with status 503 it also has the header Retry-After, with 1 second, unless they have
+    it. Raises ValueError for a status that HTTP does not know.
     """
     retry = {"Retry-After": str(RETRY_SECONDS)} if status == 503 else {}
     line = " ".join(without_password(detail).split())
@@ -488,7 +498,7 @@ class Operation:
 
     @cached_property
     def request_type(self) -> type[Struct]:
-        """The fields of a POST's body, or of a GET's query and path."""
+        """The struct type with the fields of a POST's body or a GET's query and path; cached."""
         return _request_type(self.handler, self.optional_fields)
 
     async def serve(self, request: Request) -> Response:
@@ -498,8 +508,9 @@ class Operation:
         the operation has a `raw_parameter` and the body is bytes (application/octet-stream), the
         body is the field of this name, and the other fields are read from the query. Optional
         fields that were left out are not passed on. If the handler returns no response, its result
-        is sent as JSON, a record with the fields of the response type. Raises HTTPException for a
-        request that cannot be read, ClientDisconnect for one that is cut off, and whatever the
+        is sent as JSON: a dict as it is, a record with the fields of the response type. Raises
+        HTTPException for a request that cannot be read (415 for a body of another media type; see
+        `read_body` and `read_query`), ClientDisconnect for one that is cut off, and whatever the
         handler raises; the application turns all into responses.
         """
         media = media_type(request)
@@ -564,7 +575,7 @@ class Operation:
 
 
 def _json_content(name: str, media: str = JSON) -> Json:
-    """Return an OpenAPI content object: JSON of the named schema, as the given media type."""
+    """Return an OpenAPI content object, a dict: `media` -> a reference to the schema `name`."""
     return {media: {"schema": {"$ref": REF.format(name=name)}}}
 
 

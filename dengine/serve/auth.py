@@ -134,8 +134,8 @@ def check_key_pair(cert: FilePath | None, key: FilePath | None) -> None:
 def is_loopback(host: str) -> bool:
     """Return whether only this machine can reach a server that listens at `host`.
 
-    True for the name localhost and for a loopback address, also in brackets; False for every other
-    name or address.
+    True for the name localhost, in small letters, and for a loopback address, also in brackets;
+    False for every other name or address, and for "". No name is looked up.
     """
     try:
         return ip_address(host.strip("[]")).is_loopback
@@ -144,16 +144,16 @@ def is_loopback(host: str) -> bool:
 
 
 def host_in_url(host: str) -> str:
-    """Return a host as it is written in a URL: an IPv6 address in brackets."""
+    """Return a host like in a URL: an IPv6 address, which has none yet, gets brackets."""
     return f"[{host}]" if ":" in host else host
 
 
 def names_this_machine(host: str) -> bool:
     """Return whether a request's `Host` header is localhost or a loopback address, with or without
-    a port.
+    a port, in small or capital letters.
 
-    It is False for a web page of another site whose name was made to resolve to this machine (DNS
-    rebinding): the browser sends that name as `Host`.
+    It is False for "" and for a malformed header, and for a web page of another site whose name was
+    made to resolve to this machine (DNS rebinding): the browser sends that name as `Host`.
     """
     try:
         return is_loopback(urlsplit(f"//{host}").hostname or "")
@@ -162,7 +162,10 @@ def names_this_machine(host: str) -> bool:
 
 
 def find_token(tokens: tuple[Token, ...], secret: str) -> Token | None:
-    """Return the token with this secret, or None. All tokens are compared, in constant time."""
+    """Return the token with this secret; None if there is none, also if `tokens` is empty.
+
+    All tokens are compared, in constant time.
+    """
     given = secret.encode("utf-8", "surrogatepass")
     is_same = [hmac.compare_digest(token.secret.encode(), given) for token in tokens]
     return next(compress(tokens, is_same), None)
@@ -172,8 +175,10 @@ def take_token(scope: Scope, authorization: str) -> str:
     """Return the secret that a request carries, or "" if it has none that can be read.
 
     If the path is /RPC2/SECRET, the secret is taken from it, and the path in `scope` is changed to
-    /RPC2, so that the secret is not logged later. Otherwise the secret is a bearer token or the
-    password of HTTP Basic.
+    /RPC2, so that the secret is not logged later; the header is then ignored. Otherwise the secret
+    is a bearer token or the password of HTTP Basic, whose user name is ignored. It is "" for any
+    other scheme, and for a password that is not in base64 and UTF-8. Whether the secret is right is
+    not checked.
 
     Parameters
     ----------
@@ -236,8 +241,10 @@ class Guard:
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass an allowed request on to the application, or answer it with the refusal.
 
-        What is no HTTP request, like the application's start and end, passes unchecked. The size
-        of an allowed request's body is limited while the application reads it, by `_limit_body`.
+        A refusal is a `Problem` in JSON. It closes the connection, and with 401 it has two headers
+        WWW-Authenticate, for Basic and Bearer. What is no HTTP request, like the application's
+        start and end, passes unchecked. The size of an allowed request's body is limited while the
+        application reads it, by `_limit_body`.
         """
         if scope["type"] != "http":
             await self.app(scope, receive, send)
@@ -258,11 +265,11 @@ class Guard:
         """Raise HTTPException for a request that is not allowed.
 
         The checks are, in this order: a request to a server without tokens must call it localhost
-        or by a loopback address (421); `_check_token` checks the token, and sets the context
-        variable `CURRENT_TOKEN` to it; a request that may change something must not come from a web
-        page of another site, by its headers Origin and Sec-Fetch-Site (403); and the announced
-        length of the body must be at most `MAX_BODY` (413). A token in the path is removed from
-        `scope`.
+        or by a loopback address (421); `_check_token` checks the token (401, 403), and sets the
+        context variable `CURRENT_TOKEN` to it; a request that may change something must not come
+        from a web page of another site, by its headers Origin and Sec-Fetch-Site (403); and the
+        announced length of the body must be at most `MAX_BODY` (413), 1 MiB. A token in the path is
+        removed from `scope`.
         """
         headers = Headers(scope=scope)
         host = headers.get("host", "")
@@ -311,12 +318,15 @@ class Guard:
 def _limit_body(receive: Receive) -> Receive:
     """Return an ASGI `receive` that passes on the messages of the given one.
 
-    It raises HTTPException 413 once the body of the request has more than `MAX_BODY` bytes.
+    It raises HTTPException 413 once the body of the request has more than `MAX_BODY` bytes (1 MiB),
+    in place of the message that has too many.
     """
     bytes_left = MAX_BODY
 
     async def receive_body() -> Message:
-        """Return the next message, and count its bytes; raise HTTPException 413 for too many."""
+        """Return the next message, and subtract its bytes from those that are left; raise
+        HTTPException 413 for too many.
+        """
         nonlocal bytes_left
         message = await receive()
         bytes_left -= len(message.get("body", b""))
@@ -328,7 +338,9 @@ def _limit_body(receive: Receive) -> Receive:
 
 
 def _with_headers(send: Send) -> Send:
-    """Return an ASGI `send` that adds the security headers in `HEADERS` to every response."""
+    """Return an ASGI `send` that adds the security headers in `HEADERS` to every response, after
+    the response's own.
+    """
 
     async def send_with_headers(message: Message) -> None:
         if message["type"] == "http.response.start":

@@ -100,8 +100,8 @@ class HttpApi:
 
     @cached_property
     def operations(self) -> list[Operation]:
-        """The `Operation` of every path and method: its handler, and the type of its response;
-        cached.
+        """The `Operation` of every path and method of the interface: its handler, and the type of
+        its response; cached. XML-RPC and the web page are not among them (see `create_app`).
         """
         # A guarantee may name a class, and no request over the network may cause an import.
         policy = field_types(Policy, "guarantee") | {"force_limits": list[str]}
@@ -298,7 +298,8 @@ class HttpApi:
             """Release a pinned version, record an event, begin the retrain, and return what
             changed.
 
-            If a retrain is under way, or waits until it can begin, nothing is done.
+            If a retrain is under way, or waits until it can begin, nothing is done, and the
+            `Changed` has no event.
             """
             event = None
             text = "A retrain is under way already; nothing changed."
@@ -359,7 +360,9 @@ class HttpApi:
             selection = replace(selection, action=Action.VERIFY, label="none")
 
         def read_newest(store: SqlStore) -> list[StoredDecision]:
-            """Return the newest decisions that were asked for, and one more if there are more."""
+            """Return the newest decisions that were asked for, newest first, and one more if there
+            are more; with `open_` without those whose label was forgotten.
+            """
             decisions = iterate_decisions(store, selection, limit + 1, before or None)
             if open_:  # a forgotten label was reported
                 decisions = (stored for stored in decisions if stored.source is None)
@@ -430,7 +433,9 @@ class HttpApi:
         """
 
         async def event_stream() -> AsyncIterator[str]:
-            """Yield hello, then changed or tick, as texts of server-sent events."""
+            """Yield hello, then changed or tick, as texts of server-sent events, until the service
+            ends its iterations.
+            """
             yield f"retry: {RECONNECT_MS}\nevent: hello\ndata: {__version__}\n\n"
             async for changed in self.service.changes(TICK):
                 yield f"event: {'changed' if changed else 'tick'}\ndata: -\n\n"
@@ -438,7 +443,9 @@ class HttpApi:
         return StreamingResponse(event_stream(), media_type="text/event-stream")
 
     async def me(self) -> Token:
-        """Return the name and the rights of the request's token."""
+        """Return the name and the rights of the request's token, without its secret. If the server
+        needs no token, the name is empty, and everything is allowed.
+        """
         return CURRENT_TOKEN.get()
 
     async def metrics(self) -> Response:
@@ -515,10 +522,10 @@ def _read_explanation(store: SqlStore, id_: str) -> Json:
     """Return the explanation of a decision, named by its id or its part's number, as a JSON dict.
 
     Beside the `Explanation` it has the decision's trace, the corrections of its label, the envelope
-    (low, median, high; None without one), and the newest `N_BADS` traces of bad parts among the
-    newest `N_LABELS` labels of cell and product (none if their shape differs). Raises what
-    `explain` raises, such as StoreError for a damaged trace; other damaged rows are left out, and
-    an event says so.
+    (low, median, high; None without one), and the newest `N_BADS` (10) traces of bad parts among
+    the newest `N_LABELS` (200) labels of cell and product, oldest first (none if their shape
+    differs). Raises what `explain` raises, such as StoreError for a damaged trace; other damaged
+    rows are left out, and an event says so.
     """
     explanation = explain(store, id_)
     trace = explanation.trace
@@ -546,7 +553,9 @@ def create_app(
 ) -> Starlette:
     """Create the application. The caller closes the service after it has ended.
 
-    The service gets an observer, which counts its responses for `GET /metrics`.
+    It serves the operations of `HttpApi`, XML-RPC at POST /RPC2 (`RobotCalls`), and the web page.
+    Every request first passes `Guard`; errors become `Problem`s. The service gets an observer,
+    which counts its responses for `GET /metrics`.
 
     Parameters
     ----------

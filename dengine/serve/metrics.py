@@ -20,7 +20,11 @@ RETRAIN_BUCKETS = 0.05, 0.1, 0.2, 0.3, 0.45, 0.6, 1.0, 2.0, 5.0, 15.0, 60.0
 
 
 class HistogramSpec(NamedTuple):
-    """A histogram of durations; `labels` are names of fields of what is observed."""
+    """A histogram of durations in seconds, of which `Metrics` makes dengine_NAME_seconds.
+
+    `labels` are names of fields of the observed record, and `buckets` the upper limits of the
+    buckets in seconds.
+    """
 
     name: str
     description: str
@@ -79,8 +83,9 @@ class Metrics:
         """Add the duration (`seconds`) of a response or a retrain to the histogram of its type.
 
         There are three histograms: of decisions, reports and retrains. Their Prometheus labels are
-        values of the fields that `HISTOGRAMS` names, in lower case: for a decision its action and
-        its reason. Returns nothing.
+        values of the fields that `HISTOGRAMS` names, in lower case: of a decision its action and
+        its reason, of a report its label and whether it was repeated, of a retrain whether it was
+        accepted. Returns nothing. Raises KeyError for any other type.
         """
         kind = type(response)
         record = response.decision if isinstance(response, ServiceResponse) else response
@@ -88,7 +93,10 @@ class Metrics:
         self._histograms[kind].labels(*labels).observe(response.seconds)
 
     def text(self) -> bytes:
-        """Return all metrics in Prometheus's text format."""
+        """Return all metrics in Prometheus's text format: the histograms and what `collect` gives.
+
+        The histograms count since the server's start.
+        """
         return generate_latest(self._registry)
 
     def collect(self) -> Iterator[Metric]:

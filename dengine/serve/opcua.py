@@ -92,7 +92,7 @@ class TokenUsers(UserManager):
 
         The password is the token, a text. A session is refused if the server encrypts and the
         client has no certificate, or if the server has tokens and the user name or the token is
-        wrong, or the token is a viewer's. `iserver` is not used, and the content of the certificate
+        wrong, or the token only permits reading. `iserver` is not used, and the content of the certificate
         is not checked.
         """
         if self._encrypted and not certificate:
@@ -185,6 +185,9 @@ async def opcua_server(
 class AddressSpace:
     """The nodes of one cell in an OPC UA server: its variables, methods and alarm events.
 
+    `opcua_server` makes it, and calls `build` and then `refresh`, all in the server's event loop.
+    Its methods have no recorder, and of the methods of `RobotCalls` only `decide` and `report`.
+
     Parameters
     ----------
     server : Server
@@ -220,7 +223,10 @@ class AddressSpace:
         self._events.event.SourceName = "Cell"
 
     def _node(self, name: str) -> Node:
-        """Return the node of a variable or a method of the cell."""
+        """Return the node of a variable or a method of the cell, whose NodeId is "Cell.NAME".
+
+        Whether the server has such a node is not checked. `build` must have been called.
+        """
         return self._server.get_node(f"ns={self._namespace};s=Cell.{name}")
 
     async def decide(self, trace: list[float], channels: int, request: str, part: str) -> list[Any]:
@@ -233,9 +239,10 @@ class AddressSpace:
 
         If the queue is full, or the service or its engine is closed, the result is VERIFY with an
         empty id, the reason "busy", the bounds 0 and 1, and version 0. Raises TraceError if the
-        trace is empty, if its length is not a multiple of `channels`, for a trace or part that the
-        engine does not take, and for an id of another trace. Raises ReportError for an invalid id,
-        and SettingError for a first trace that the settings do not allow.
+        trace is empty, if `channels` is below 1 or the trace's length no multiple of it, for a
+        trace or part that the engine does not take, and for an id of another trace. Raises
+        ReportError for an invalid id, and SettingError for a first trace that the settings do not
+        allow.
         """
         if channels < 1 or len(trace) % channels or not trace:
             raise TraceError(
@@ -289,8 +296,9 @@ class AddressSpace:
         """Write a status, as `RobotCalls.status` returns it, into the OPC UA variables.
 
         If the text of the alarm differs from that of the last call (before the first call: ""), an
-        event with the new text is sent. If the new text is empty, the event says that the alarm has
-        ended.
+        event with the new text is sent, of severity 700. If the new text is empty, the event says
+        that the old alarm has ended, with severity 100. Raises KeyError for a status that lacks a
+        value of `STATUS_NAMES`.
         """
         for name, key in STATUS_NAMES.items():
             node = self._node(name)
@@ -324,7 +332,8 @@ class AddressSpace:
 
         async def method(parent: ua.NodeId, *variants: ua.Variant) -> Any:
             """Check the arguments, call, and return the results; for an error write its text into
-            LastRefused, and return a bad status code.
+            LastRefused, and return a bad status code: BadInternalError for an unexpected error,
+            BadInvalidArgument for any other. `parent` is not used.
             """
             # Controllers send an empty text as null.
             texts = [ua.Variant("") if item.Value is None else item for item in variants]
@@ -352,7 +361,9 @@ def _type_of(argument: ua.Argument) -> VariantType:
 
 
 def _form(variant_type: VariantType, is_array: bool) -> str:
-    """Return the name of an argument's type for messages, such as "Float array"."""
+    """Return the name of an argument's type for messages: "Float array" if `is_array`, else
+    "Float". Two arguments have the same type if these names are equal.
+    """
     return f"{variant_type.name}{' array' * is_array}"
 
 

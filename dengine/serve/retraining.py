@@ -86,7 +86,8 @@ class RetrainingProcess(Executor):
         """Kill the process at once, also during a retrain, whose future then fails.
 
         An engine waits for its retrain before this. With `wait` it returns when the executor's
-        thread has ended.
+        thread has ended. Later calls of `submit` raise RuntimeError, unless `restart` starts
+        another process. `cancel_futures` is as in `Executor.shutdown`.
         """
         self._process.kill()
         self._pool.shutdown(wait, cancel_futures=cancel_futures)
@@ -103,7 +104,11 @@ class _SharedPickle:
         self._value = value
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Return what unpickles the value, from a new file, which is closed with this object."""
+        """Return the function that unpickles the value, and its arguments; pickle calls this.
+
+        The value is pickled now, into a new file, which is closed when this object is deleted. If
+        the system has no `memfd_create`, it is pickled into bytes.
+        """
         if not hasattr(os, "memfd_create"):
             return pickle.loads, (pickle.dumps(self._value),)
         descriptor = os.memfd_create("dengine")
@@ -165,7 +170,9 @@ def _prepare_process() -> None:
 
 
 def _warm_up() -> None:
-    """Import torch and its optimisers in this process, before the first retrain."""
+    """Import torch and take one step of its optimiser in this process, so that the first retrain
+    need not wait for what torch imports then.
+    """
     from ..reducers.torch_reducer import warm_optimizer
 
     warm_optimizer()

@@ -67,6 +67,9 @@ UNRECORDED: Struct = {"action": 0, "id": "", "lower": 0.0, "upper": 1.0, "versio
 class RobotCalls:
     """The methods that a robot's program can call, on one service.
 
+    They run in the server's event loop. The pieces of traces that `add` took are only in this
+    object, not in the store; XML-RPC and OPC UA have an object each.
+
     Parameters
     ----------
     service : CellService
@@ -226,7 +229,8 @@ class RobotCalls:
         `RECORD_SECONDS` for the recording. Only the part of the newest `begin` has a recording, and
         only for one call, even if that call times out or is refused. If there is no recording, or
         the recorder fails, which is logged, the result is verify with an id "" and the reason
-        "not_recorded", and nothing is stored.
+        "not_recorded", and nothing is stored. An insertion that is incomplete after this time has
+        NaN for its missing samples, so it is verified and stored with that fault.
 
         Parameters
         ----------
@@ -272,16 +276,23 @@ class RobotCalls:
         """Return only the action of `decide` (0 verify, 1 accept, 2 reject), for a controller
         without structs.
 
-        `report` needs the id, which is therefore the caller's own.
+        `report` needs the id, which is therefore the caller's own. Raises what `decide` raises; if
+        the queue is full, or the service is closed, the action is 0 and nothing is recorded.
         """
         return int((await self.decide(trace, request, part))["action"])
 
     async def action_added(self, request: Any, part: Any = "") -> int:
-        """Return only the action of `decide_added`: 0 verify, 1 accept, 2 reject."""
+        """Return only the action of `decide_added`: 0 verify, 1 accept, 2 reject.
+
+        Raises what `decide_added` raises. It is 0, too, if nothing was recorded.
+        """
         return int((await self.decide_added(request, part))["action"])
 
     async def action_recorded(self, request: Any, part: Any = "") -> int:
-        """Return only the action of `decide_recorded`: 0 verify, 1 accept, 2 reject."""
+        """Return only the action of `decide_recorded`: 0 verify, 1 accept, 2 reject.
+
+        Raises what `decide_recorded` raises. It is 0, too, if there is no recording.
+        """
         return int((await self.decide_recorded(request, part))["action"])
 
     async def decide_array(self, trace: ArrayLike, request: Any, part: Any) -> Struct:
@@ -386,13 +397,15 @@ class RobotCalls:
 
 
 def one_line(text: str) -> str:
-    """Return a text as one printable line of at most 300 characters."""
+    """Return a text as one line: each unprintable character, like a line break, becomes a space,
+    and what is beyond 300 characters is cut off.
+    """
     return "".join(c if c.isprintable() else " " for c in text)[:300]
 
 
 def _as_struct(decision: Decision) -> Struct:
     """Return a decision as a dict of plain types: action (0 verify, 1 accept, 2 reject), id,
-    reason, lower, upper and version.
+    reason (a text), lower, upper, and version, the number of the model version that decided.
     """
     return {
         "action": ACTIONS.index(decision.action),

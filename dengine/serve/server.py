@@ -70,7 +70,9 @@ class LineFormatter(logging.Formatter):
     """
 
     def format(self, record: logging.LogRecord) -> str:
-        """Return a record as one line."""
+        """Return a record as one line: "TIME level=LEVEL logger=NAME message=TEXT", the level in
+        small letters, and the text, with a traceback if there is one, as a JSON string.
+        """
         text = json.dumps(without_password(super().format(record)))
         time = self.formatTime(record)
         return f"{time} level={record.levelname.lower()} logger={record.name} message={text}"
@@ -191,7 +193,7 @@ def serve(
             server = CellServer(uvicorn.Config(app, **options), service, lambda: say(line))
 
             async def run() -> None:
-                """Start what runs beside the server, and serve until a signal comes."""
+                """Start what runs beside the server, serve until a signal comes, and end it."""
                 async with AsyncExitStack() as stack:
                     for start in beside:
                         await stack.enter_async_context(start(service))
@@ -220,7 +222,7 @@ class CellServer(uvicorn.Server):
         self._say = say
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
-        """Listen, and call `say`."""
+        """Listen on the given sockets like `uvicorn.Server.startup`, and then call `say` once."""
         await super().startup(sockets)
         self._say()
 

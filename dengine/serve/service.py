@@ -150,6 +150,9 @@ class CellService:
     observers : list of callable
         Each is called with every ServiceResponse, ReportResponse and RetrainReport, in the thread
         where it arises.
+    read_store : SqlStore
+        The second connection to the store, by which `read` reads; the engine's own store if that is
+        in memory.
     """
 
     def __init__(
@@ -233,7 +236,9 @@ class CellService:
         # With the caller's id the decision must be on disk before the response: the caller may
         # send the request again. Without one it cannot.
         def work(engine: DataEngine, late: bool) -> Decision:
-            """Decide in the engine's thread; `late` says that the caller has timed out."""
+            """Decide in the engine's thread; `late` says that the caller has timed out, so that the
+            part is recorded as VERIFY under `id_` without asking the model.
+            """
             decision_id = id_ if late or request is not None else None
             return engine.decide(trace, part, decision_id=decision_id, timed_out=late)
 
@@ -296,7 +301,9 @@ class CellService:
             """
 
             def has_label() -> bool:
-                """Return whether the decision has the reported label already."""
+                """Return whether the decision has the reported label already, as corrected; False
+                for an unknown id, and without a label.
+                """
                 stored = engine.find(decision_id)
                 return stored is not None and stored.success is label
 
@@ -327,17 +334,19 @@ class CellService:
     async def find(self, decision_id: str) -> StoredDecision | None:
         """Return a decision with its trace and label, after waiting for the engine's thread.
 
-        None for an unknown id. Raises BusyError if the queue is full or the service is closing,
-        StoreError if the id cannot be looked up, and ReportError for an invalid id.
+        None for an unknown id. Listeners to `changes` are not notified. Raises BusyError if the
+        queue is full or the service is closing, StoreError if the id cannot be looked up, and
+        ReportError for an invalid id.
         """
         return await self.call(lambda engine: engine.find(decision_id), read_only=True)
 
     async def call(self, work: Callable[[DataEngine], T], read_only: bool = False) -> T:
         """Call a function with the engine in the engine's thread, and return or raise what it does.
 
-        It waits in the queue, without a deadline. With `read_only` the function changes nothing,
-        and listeners to `changes` are not notified. Raises BusyError if the queue is full or the
-        service is closing; nothing is called then.
+        It waits in the queue, without a deadline; if the waiting is cancelled, the function is
+        called all the same. With `read_only` the function changes nothing, and listeners to
+        `changes` are not notified. Raises BusyError if the queue is full or the service is closing;
+        nothing is called then.
         """
         return await asyncio.wrap_future(self.submit(lambda engine, late: work(engine), read_only))
 
@@ -391,12 +400,15 @@ class CellService:
 
     @property
     def waiting(self) -> int:
-        """Requests in the queue."""
+        """Number of requests in the queue, without the one that the engine's thread works on."""
         return self._jobs.qsize()
 
     @property
     def silent_seconds(self) -> float:
-        """Seconds since the engine's thread last took or awaited a job; infinity if it ended."""
+        """Seconds since the engine's thread last began to wait for a job; infinity if it ended.
+
+        They grow while it works on one job, or on a retrain that runs in this thread.
+        """
         if not self._thread.is_alive():
             return float("inf")
         return time.monotonic() - self._last_active
@@ -423,7 +435,10 @@ class CellService:
             self._listeners.discard(listener)
 
     def end_listening(self) -> None:
-        """End every iteration over `changes`, for good, because the server is about to close."""
+        """End every iteration over `changes`, for good, because the server is about to close.
+
+        Requests are still answered. It returns at once, and may be called in any thread.
+        """
         self._listening_ended = True
         self._notify_listeners()
 
@@ -513,7 +528,9 @@ class CellService:
             timeout = SHORT_WAIT if engine.state.is_swapping else IDLE_WAIT
 
     def _notify_listeners(self) -> None:
-        """Wake every iteration over `changes`, in its event loop."""
+        """Wake every iteration over `changes`, in its event loop; one whose loop has ended is
+        passed over. It may be called in any thread.
+        """
         for loop, event in tuple(self._listeners):
             with suppress(RuntimeError):  # the loop has ended
                 loop.call_soon_threadsafe(event.set)

@@ -36,7 +36,8 @@ NO_REPORT = 2  # a report that does
 def parse_call(body: bytes) -> tuple[str, tuple[Any, ...]]:
     """Return the method's name and a tuple of the arguments of an XML-RPC call.
 
-    The arguments are Python values of the types that XML-RPC has, base64 as bytes. Raises
+    The arguments are Python values of the types that XML-RPC has, base64 as bytes; the tuple is
+    empty for a call without arguments. Whether there is such a method is not checked. Raises
     ValueError for a body that is no XML, is no call, or has a document type.
     """
     values: Any = xmlrpc.client.Unmarshaller(use_builtin_types=True)
@@ -55,7 +56,10 @@ def parse_call(body: bytes) -> tuple[str, tuple[Any, ...]]:
 
 
 def rpc_route(calls: RobotCalls) -> Route:
-    """Return the route of POST /RPC2, which calls the methods of `calls`."""
+    """Return the route of POST /RPC2, which calls the methods of `calls` (see `call_method`).
+
+    A body of another media type than text/xml or application/xml gets 415.
+    """
 
     async def rpc(request: Request) -> Response:
         """Respond with a value or a fault in XML; HTTPException 415 for another media type."""
@@ -70,9 +74,11 @@ def rpc_route(calls: RobotCalls) -> Route:
 async def call_method(calls: RobotCalls, body: bytes) -> bytes:
     """Call the method that an XML-RPC request names, and return its value or a fault as XML.
 
-    `calls` has the methods, of which those in `CALLS` may be called, and `body` is the request. It
-    raises nothing: a body that cannot be read, an unknown method, wrong arguments and each error of
-    the method become faults, with a code and one line of text. An unexpected error is logged.
+    `calls` has the methods, of which those in `CALLS` may be called, and `body` is the request,
+    which is parsed in another thread. It raises nothing: everything becomes a fault with one line
+    of text and a code: a body that cannot be read (-32700), an unknown method (-32601), a wrong
+    number of arguments (-32602), a ReportError (2), another DengineError (1), and any other error
+    of the method (-32603), or a value that XML-RPC cannot carry. The last two are logged.
     """
     try:
         name, arguments = await asyncio.to_thread(parse_call, body)
@@ -99,6 +105,9 @@ async def call_method(calls: RobotCalls, body: bytes) -> bytes:
 
 
 def fault(code: int, text: str) -> bytes:
-    """Return an XML-RPC fault as bytes, its text cut to one printable line."""
+    """Return an XML-RPC fault, a method response in XML, as bytes.
+
+    Its text is put on one printable line and cut to 300 characters (`one_line`).
+    """
     error = xmlrpc.client.Fault(code, one_line(text))
     return xmlrpc.client.dumps(error, methodresponse=True).encode("utf-8", "replace")
