@@ -305,10 +305,12 @@ def verify(
     Every row is compared with its checksum, and every entry of the ledger, a chain of digests over
     the rows, with its rows. The subcommand lists damage of an SQLite file, rows and settings that
     were changed, rows that are missing or that are in no entry, damaged or missing records of a
-    journal, data that was lost, and a --expect that the history does not hold, at most 20 in all.
-    If there are any, the exit code is 1. The subcommand writes rows only with --acknowledge, after
-    which it checks again (an SQLite file is set to WAL mode if it is not). Engines may run
-    meanwhile.
+    journal, data that was lost, and a --expect that the history does not hold, at most 20 in all
+    (--json: each that was found). If there are any, the exit code is 1. For each cell it shows the
+    number of entries and rows, and the newest digest: keep it elsewhere for --expect. It also says
+    if a cell's journal is missing, which alone is no fault. The subcommand writes rows only with
+    --acknowledge, after which it checks again (an SQLite file is set to WAL mode if it is not).
+    Engines may run meanwhile.
     """
     from ..store.sql import SqlStore
     from ..store.verification import verify_history

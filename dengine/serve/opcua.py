@@ -92,8 +92,8 @@ class TokenUsers(UserManager):
 
         The password is the token, a text. A session is refused if the server encrypts and the
         client has no certificate, or if the server has tokens and the user name or the token is
-        wrong, or the token only permits reading. `iserver` is not used, and the content of the certificate
-        is not checked.
+        wrong, or the token only permits reading. `iserver` is not used, and the content of the
+        certificate is not checked.
         """
         if self._encrypted and not certificate:
             return None
