@@ -246,9 +246,11 @@ def _read_own_table(path: Path) -> Dataset:
 def _from_own_frame(frame: Any, name: str = "table") -> Dataset:
     """Return the data set of a DataFrame that `Dataset.to_frame` made; `name` becomes its name.
 
-    All columns but label, part and cause are samples. Raises DataError if `make_dataset` refuses
-    its arrays, KeyError if it has no longer a column `label`, and ValueError if columns of samples
-    are no numbers or their number is not that of `attrs`.
+    All columns but label, part and cause are samples; each channel gets an equal share of them, in
+    order. Raises DataError if `make_dataset` refuses its arrays, KeyError if it has no longer a
+    column `label`, and ValueError if columns of samples are no numbers or their number is no
+    multiple of the number of channels in `attrs`. Other columns that were added or removed are not
+    noticed.
     """
     about = {**frame.attrs[OWN]}
     words = frame[frame.columns.intersection(["part", "cause"])].astype(str)

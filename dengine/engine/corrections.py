@@ -410,13 +410,13 @@ class Corrections:
     def _change_labels(self, change: Change) -> Changed:
         """Store a change of labels, apply it to references, window and rule; return what was done.
 
-        The decisions leave the outbox's memory. A model that cannot change its references is
-        retrained, in this thread, or, if it is pinned, fitted again as a new version. The store is
-        checked against its ledger; a difference sets the outbox's `integrity_error`. If a safe mode
-        begins or ends by this, an event is recorded, and `on_safe_mode`, the user's function, is
-        called. Raises StoreError if the store does not answer, and what a pinned model raises that
-        is fitted again; a change that is stored by then is applied with the next one, or when the
-        store is opened again.
+        The outbox drops the changed decisions from its memory, and will read them from the store.
+        A model that cannot change its references is retrained, in this thread, or, if it is pinned,
+        fitted again as a new version. The store is checked against its ledger; a difference sets
+        the outbox's `integrity_error`. If a safe mode begins or ends by this, an event is recorded,
+        and `on_safe_mode`, the user's function, is called. Raises StoreError if the store does not
+        answer, and what a pinned model raises that is fitted again; a change that is stored by then
+        is applied with the next one, or when the store is opened again.
         """
         number = self._store.corrections.apply(change)
         for id_ in change.decisions:

@@ -92,13 +92,16 @@ class Learner:
         self._start: tuple[tuple[int, int], EngineModel, str] | None = None
 
     def resume(self, label_within: int, policy_since: int) -> None:
-        """Restore training window, version, rule and counts from the store, bit for bit.
+        """Restore training window, version, rule and counts from the store.
 
-        It is called when an engine opens the store. `label_within` is the number of later decisions
-        after which a check without a report is overdue, and `policy_since` the first version under
-        the policy in force. If there is a version, or at least IMPORTED labels (500), this also
-        starts a thread that computes in advance for the next retrain (`precompute`). Raises
-        StoreError if the store cannot be read, and the other errors of `LiveModel.resume`.
+        It is called when an engine opens the store. The version is restored bit for bit; but a
+        model of which the store has only the numbers of its traces is trained on them again, and if
+        one of these is damaged or missing, no model is in force. A difference to the ledger sets
+        the outbox's `integrity_error`. `label_within` is the number of later decisions after which
+        a check without a report is overdue, and `policy_since` the first version under the policy
+        in force. If a model is in force, or the training window has at least IMPORTED labels (500),
+        this also starts a thread that computes in advance for the next retrain (`precompute`).
+        Raises StoreError if the store cannot be read, and the other errors of `LiveModel.resume`.
         """
         version = self._store.versions.newest()
         reports = self._store.versions.retrains()

@@ -146,7 +146,8 @@ class Neighbors:
             Numbers of the labels, increasing; the same number stands for the same trace as before.
             A trace of this object whose number is not among them is dropped.
         make_frames : Frames
-            The module that computed `frames`.
+            The module that computed this object's `frames`, the sums of samples by which distances
+            are measured.
 
         Returns
         -------

@@ -206,8 +206,9 @@ class RobotCalls:
         drops the pieces, even if the store did not record it (reason "no_store"). If the queue is
         full, or the service or its engine is closed, the result is VERIFY with an empty id and the
         reason "busy", and the pieces stay, so that the call can be repeated. Raises TraceError if
-        there are no pieces or the engine does not take the trace or part, ReportError for an
-        invalid id, and SettingError for a first trace that the settings do not allow.
+        there are no pieces (also for an id that has a decision, if it cannot be looked up now) or
+        the engine does not take the trace or part, ReportError for an invalid id, and SettingError
+        for a first trace that the settings do not allow.
         """
         if (stored := await self._find(request)) is not None:
             return stored

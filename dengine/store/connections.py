@@ -441,8 +441,8 @@ class Database:
     def has_entry(self, number: int, digest: str) -> bool:
         """Return whether the cell's ledger has an entry with this number and hexadecimal digest.
 
-        The records that wait in the outbox are written first. Raise StoreError if the database
-        fails.
+        The records that wait in the outbox are written first, if the database takes them in time.
+        Raise StoreError if the database fails.
         """
         rows = self.read(
             sa.select(LEDGER.c.digest).where(self.own(LEDGER), LEDGER.c.number == number)
@@ -502,7 +502,8 @@ class Database:
     def check_writable(self) -> None:
         """Raise a StoreError if the database cannot be written; an update of no row shows this.
 
-        The records that wait in the outbox are written first. Nothing is added to the ledger.
+        The records that wait in the outbox are written first, if the database takes them in time;
+        the update itself adds nothing to the ledger.
         """
         self.write(
             lambda connection: connection.exec_driver_sql(

@@ -162,13 +162,13 @@ def propose_rate(p: Proposal, tables: Tables) -> None:
     """Set `time.rate_hz` in `p`, from the median over the recordings of the mean step of time.
 
     `tables` has the samples of each recording. Steps below 0 are left out of the mean, and the rate
-    is rounded to five digits. It is `?`, with a note, if it is not between 1 Hz and 1 MHz; then no
-    gaps are looked for. If more recordings than 10 % plus one would be faults because of their
-    times (`check_steps`, by the stated rate and gap), `time.gap` is set to `?`, with a note on the
-    first. If all recordings start after 1999 (UTC), `order` is set to `time`, also if the rate is
-    `?`. Recordings whose times cannot be read are skipped. Stated keys stay. Raises DataError if a
-    stated format is no form or unit of times, or if a setting in `[time]` is wrong (see
-    `check_clock`).
+    is rounded to five digits. It is `?`, with a note, if it is not between 1 Hz and 1 MHz; then
+    `time.gap`, the longest step that is allowed, is not looked at. Otherwise `check_steps` checks
+    the times, by the rate and the gap that the description has by then. If it refuses more
+    recordings than 10 % plus one, `time.gap` is set to `?`, with a note on the first. If all
+    recordings start after 1999 (UTC), `order` is set to `time`, also if the rate is `?`. Recordings
+    whose times cannot be read are skipped. Stated keys stay. Raises DataError if a stated format is
+    no form or unit of times, or if a setting in `[time]` is wrong (see `check_clock`).
     """
     clock = p.description.time
     check_clock(clock)

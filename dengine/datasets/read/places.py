@@ -232,8 +232,8 @@ def read_labels(base: Path, source: LabelSource, form: TextForm) -> LabelReader:
     The listing stands in the folder `base`, and is a text in the encoding of `form` or a Parquet
     file. Rows of one key stay together, in their order. Raises DataError if it cannot be read, or
     if `source.key` and `source.column`, the columns of keys and words in it, are not both stated
-    and there, and LookupError for an encoding that Python does not know. A path that is no valid
-    expression is not noticed here.
+    and there, and LookupError for an encoding that Python does not know. Whether `source.path` is a
+    regular expression is not checked here.
     """
     listing = defaultdict[str, list[str]](list)
     if source.listing:
