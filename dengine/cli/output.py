@@ -386,7 +386,7 @@ def progress_bar(label: str, total: int | None) -> Iterator[Callable[[int], None
 
 @contextmanager
 def _progress_lines(label: str, total: int | None) -> Iterator[Callable[[int], None]]:
-    """Write a line on the progress to stderr every `LINE_SECONDS` while the block runs.
+    """Write a line on the progress to stderr every 30 s (`LINE_SECONDS`) while the block runs.
 
     A thread writes the lines: `label`, the number of steps done of `total` ("?" if it is None or
     0), and the time so far. The function that is yielded, `advance(n)`, adds n steps and writes

@@ -333,7 +333,9 @@ class Feedback:
 
         An event is recorded, then the user's function `on_safe_mode` is called. It gets the reason
         of a safe mode that began, or "" if it ended; then the event says `reason_ended`. A safe
-        mode begins after an alarm of the rule. If recording the event or the user's function fails,
+        mode begins after an alarm of the rule. If another alarm changes the reason of a safe mode,
+        it is announced once more, as one that began. What changed and changed back between two
+        calls is not announced. If recording the event or the user's function fails,
         that is logged and not tried again; callers do this only after labels are stored, so that
         such a failure costs no label.
         """

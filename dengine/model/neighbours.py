@@ -910,7 +910,8 @@ def near_repeats(traces: Floats, parts: NDArray[np.int64]) -> int:
         Oldest first; only the newest 500 (`NEWEST`) are read, and they are compared with each
         other.
     parts : array of int64, shape (n,)
-        Hash of each trace's part.
+        Hash of each trace's part; if the part is unknown, the content hash of the trace, not 0.
+        Traces with equal hashes are not compared.
 
     Returns
     -------

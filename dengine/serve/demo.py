@@ -55,10 +55,10 @@ async def playing(service: CellService, data: Any, seed: int) -> AsyncIterator[N
 
 
 async def drive(service: CellService, cell: ReplayCell) -> None:
-    """Insert every part of a recording once, ask the service for a decision, and report the
+    """Insert every part of a data set once, ask the service for a decision, and report the
     outcome.
 
-    `cell` plays the recording, in the order of `cell.order`, from its first part on; parts have the
+    `cell` plays them, in the order of `cell.order`, from its first part on; parts have the
     numbers "0001", "0002" and so on. The recorded result is reported for verified parts, and for
     accepted parts that are bad, which stop the line. The first `N_FAST` parts (150) come without a
     pause, but a retrain that is under way is waited for; later parts come once a second, and their

@@ -279,8 +279,9 @@ class CellService:
         ------
         ReportError
             For an unknown or invalid id, for a value that is no label, and for another label than
-            the one that the decision has, also if that was forgotten; but a line stop after a
-            confirmation is no error and corrects the label.
+            the one that the decision has; but a line stop after a confirmation is no error and
+            corrects the label. If the label of the decision was forgotten, for every label, also
+            the same and that of a line stop.
         StoreError
             If the label is not known to be on disk, or the id cannot be looked up: report it again.
             Also if the engine is closed, and if only the event cannot be stored; it is then missing

@@ -73,7 +73,9 @@ def with_meanings(source: LabelSource, words: Names) -> LabelSource:
     would be empty. The same holds for a path if either is empty: `pass_1.csv` alone proves nothing.
     True, yes or 1 and their opposites, alone or with words for unchecked, have known meanings only
     if the name of the column, line or topic is one for good, like `success`, not `failed`; in a
-    path that takes any word they have none.
+    path that takes any word they have none. Beside other words, and in a path whose expression
+    lists its words, true means good and false bad, whatever the name is; yes, 1 and their opposites
+    have no known meaning there.
     """
     words = sorted({*words})
     name = source.column or source.line or source.topic or ("([^" in source.path and source.path)

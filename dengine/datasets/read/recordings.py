@@ -242,8 +242,9 @@ def files_of(
     The data set has the name of the folder, or of the file without its suffix. All files of a bag
     are read here, into one table; a fault of each damaged one is appended to `faults`. A DataFrame
     gives one table, called "table", and the current folder. Raises DataError if there is no file, a
-    pattern in `files` is malformed, or the bag cannot be read (see `read_bag`), and SettingError if
-    `windows.trigger` of a bag is malformed.
+    pattern in `files` is malformed, or the bag cannot be read (see `read_bag`), SettingError if
+    `windows.trigger` of a bag is malformed, and ValueError if the index of the DataFrame is named
+    like one of its columns.
     """
     if not isinstance(source, Path):
         return FRAME, Path(), [read_frame(source, FRAME)]
@@ -278,8 +279,9 @@ def dataset_of(recordings: Sequence[Recording], description: Description) -> Dat
     `ordered` is False if the label changes exactly once from one recording to the next. `fit` is
     "strict" if the recordings were resampled at the stated rate of their clock, since live traces
     then come at this rate; otherwise it is `traces.lengths` of the description, "pad" for
-    "pad-all". `limit` is that of the first channel. `part` is None if no recording has a part
-    number. Raises DataError if `make_dataset` refuses the traces.
+    "pad-all". (`fit` says what happens to live traces of another length.) `limit`, the range of the
+    sensor, is that of the first channel, None if it is not known. `part` is None if no recording
+    has a part number. Raises DataError if `make_dataset` refuses the traces.
     """
     X, labels, parts, sources, lengths = (
         np.array([getattr(recording, key) for recording in recordings])
