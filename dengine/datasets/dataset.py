@@ -187,7 +187,7 @@ class Dataset:
 
         Its X is a copy, for one channel of shape (n, T). `channels` and `unit` become those of the
         selected channels; all other fields stay. Raises DataError for an unknown name, for no name,
-        and if the channels of the data set have no names.
+        and if the channels of the data set have no names, and SettingError where `spec` does.
         """
         names = ", ".join(self.channels) or "none, its channels have no names"
         is_known = set() < {*channels} <= {*self.channels}

@@ -100,8 +100,10 @@ class Corrections:
         fold of its trace stays. A baseline, which cannot take a label back, is retrained before
         this returns; if it is pinned, it is fitted again as a new version. The label as it was
         reported stays in the store. A training under way in the executor is discarded, and begins
-        again, even if nothing changes. If a safe mode begins or ends by this, an event is recorded,
-        and `on_safe_mode`, the user's function, is called.
+        again, even if nothing changes; one that is done is put in force or dropped. See the class
+        for what else every change does first, and for the check against the ledger. If a safe mode
+        begins or ends by this, an event is recorded, and `on_safe_mode`, the user's function, is
+        called.
 
         Parameters
         ----------
@@ -122,9 +124,10 @@ class Corrections:
             For an unknown decision, for a decision without a label, and for a `success` that is no
             label.
         StoreError
-            If the store does not answer, the decision's trace is damaged, or the engine is closed,
-            was opened for reading or before a fork. A change that was stored before the error stays
-            stored.
+            If the store does not answer, the decision's trace is damaged, another cell of the
+            product stores a version meanwhile and a pinned baseline is to be fitted again, or the
+            engine is closed, was opened for reading or before a fork. A change that was stored
+            before the error stays stored.
         Exception
             What a pinned baseline raises that is fitted again; the change is stored then.
         """

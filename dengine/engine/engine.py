@@ -257,11 +257,13 @@ class DataEngine(AbstractContextManager["DataEngine"]):
     def _resume(self) -> None:
         """Restore what the store holds: version, references, rule, labels and pending checks.
 
-        The engine then decides bit for bit as before it was closed. A new cell of a product decides
-        by the product's newest version. It is called once, before the first decision, and waits for
+        The engine then decides bit for bit as before it was closed, with two exceptions: if the
+        newest version is damaged, the newest intact one decides, and if the store differs from its
+        ledger, every part is verified. A new cell of a product decides by the product's newest
+        version. It is called once, before the first decision, and waits for
         the store without a time limit. If retrains run in the calling thread, it also waits until
-        the first retrain can begin without delay. Raises StoreError if the store cannot be read,
-        and the other errors of `LiveModel.resume`.
+        the first retrain can begin without delay. Raises the errors of `LiveModel.resume` and
+        `Feedback.resume`; StoreError if the store cannot be read is one of them.
         """
         settings = self._settings.now
         self._learner.resume(settings.recipe.policy.label_within, settings.policy_since)

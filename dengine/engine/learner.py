@@ -538,7 +538,7 @@ class Learner:
 
         These are versions and corrections of the product's other cells, and with `with_labels` the
         labels of all cells. If the store gave no answer, or this cell's labels could not be stored,
-        that is logged, once until it answers again, and nothing is raised.
+        the result is False; this is logged, once until it answers again, and nothing is raised.
         """
         failure = None
         try:

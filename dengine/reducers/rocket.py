@@ -341,9 +341,10 @@ class RocketReducer(ProbabilityReducer):
         return self.train_heads(traces, y, folds, stop or StopRule(), numbers)
 
     def _initialize(self, traces: Floats) -> None:
-        """Build the module `net_`, with channel scales and kernels from traces (n, C, T).
+        """Build the module `net_`, with kernels and the channels' scales from traces (n, C, T).
 
-        No label is read. Earlier fits are discarded. Raises SettingError for a parameter out of its
+        A channel's scale makes its samples have deviation 1. The classifier heads are 0. No label
+        is read. Earlier fits are discarded. Raises SettingError for a parameter out of its
         range or fewer than 2 samples.
         """
         x = torch.from_numpy(traces)

@@ -421,9 +421,10 @@ class Journal:
         self.reserve()
 
     def _scan(self) -> None:
-        """Read header, head and all records that the store lacks; set the journal's attributes.
+        """Read the header and all records that the store lacks; set the journal's attributes.
 
-        With a damaged header the store counts as lacking every record. Records that are damaged or
+        The records are compared with `head`, which was read before. With a damaged header the store
+        counts as lacking every record, and `head` is not compared. Records that are damaged or
         missing are described in `loss`, and not raised. An unfinished record at the end is left
         out. Nothing is written. Raise StoreError if the file is no journal, and OSError if it
         cannot be read. An empty file is a journal without records.

@@ -131,7 +131,11 @@ def list_cells(url: str) -> list[CellSummary]:
 
 
 def _summarize(connection: sa.Connection, cell: Scope) -> CellSummary:
-    """Return the summary of a cell; `cell` also names its product, whose newest version counts."""
+    """Return the summary of a cell, as `list_cells` describes it.
+
+    `cell` has the cell's id and its product. With a product, `version` is the newest version of all
+    its cells.
+    """
     (n_decisions, last_decision), (n_labels, last_label) = (
         connection.execute(
             sa.select(sa.func.count(), sa.func.max(table.c.time)).where(

@@ -249,12 +249,13 @@ def propose_tables(p: Proposal, files: Tables) -> None:
 
     A stated layout stays; if it is `long`, `part.column` is looked for all the same. `files` has
     the table of each file that is looked at. At most the first 50,000 rows of each are used;
-    `p.is_cut` is set if a file has more. `p.tables` becomes the tables of the parts, and `p.names`
-    is emptied unless each file is one part. If the layout or `part.column` is `?`, nothing more is
+    `p.is_cut` is set if a file has more. `p.tables` becomes the tables of the first 240 parts
+    without damage, with only the rows that are samples, `p.columns` their columns, and `p.names` is
+    emptied unless each file is one part. If the layout or `part.column` is `?`, nothing more is
     proposed: `p.tables` and `p.names` stay, and a note on `channels` says why. Raises DataError if
-    there is no part, or only a table of results, if the tables do not split as a stated layout
-    says, or if a stated column, setting in `[time]` or source of labels is wrong, and SettingError
-    for a malformed `windows.trigger`.
+    there is no part without damage, or only a table of results, if the tables do not split as a
+    stated layout says, or if a stated column, setting in `[time]` or source of labels is wrong, and
+    SettingError for a malformed `windows.trigger`.
     """
     p.is_cut |= any(len(table.lines) > MOST_ROWS for table in files)
     files = [table.take(slice(MOST_ROWS)) for table in files]

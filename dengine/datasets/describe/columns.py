@@ -82,8 +82,8 @@ class Column:
     def strange(self) -> Counter[str]:
         """How often each word comes that is no number and does not mean a lost sample.
 
-        These are the `odd` words that are neither in `LOST`, in any case of letters, nor in
-        `text.missing`.
+        These are the words in `odd`, which are no numbers with any decimal mark, without those in
+        `LOST`, in any case of letters, and in `text.missing`.
         """
         return Counter(
             {
@@ -103,8 +103,9 @@ class Column:
     def numbers(self) -> list[Floats]:
         """The numbers of each recording whose cells are all numbers, as `[text]` writes them.
 
-        There is an array (rows,) for each. A word of `text.missing` is NaN. Recordings with other
-        cells are left out.
+        There is an array for each: (rows,), or (1,) if one cell holds for all rows. A word of
+        `text.missing` is NaN. Recordings with other cells are left out, and so are those with a
+        number that is too large for float32.
         """
         numbers = list[Floats]()
         for table in self.tables:
