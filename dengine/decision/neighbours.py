@@ -89,9 +89,10 @@ class RadiusNeighbours(nn.Module):
         action : int
             0 verify, 1 accept, 2 reject.
         lower, upper : float
-            Bound on the success probability, from the counts. If `scored`, both are the mean of the
-            first coordinates in the K spaces, drawn towards 1/2 by the rule's `prior_labels` and
-            the number of all references (`fade`), and the action follows from this mean.
+            Bound on the success probability, from the counts. If the module is `scored`, the first
+            coordinate in each of the K spaces is a probability of success: both are the mean of
+            these, drawn towards 1/2 by the rule's `prior_labels` and the number of all references
+            (`fade`), and the action follows from this mean.
         n_success, n_failure : int
             Labels within the radius; several labels of one part may count as fewer
             (`RadiusIndex.count_votes`).

@@ -311,11 +311,13 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         """Open a used store, and go on with the same version and the same decisions, bit for bit.
 
         The engine owns the cell until `close`, unless it only reads, and limits this thread to one
-        torch thread. Records that an earlier process left in the journal are written to the store.
-        What in the store is not as it was written is not raised: every part is verified then
-        (`EngineState.integrity_error`). Without an executor, unless it only reads, the call also
-        waits until a retrain can begin at once. If it raises, a store that it opened is closed; an
-        `SqlStore` that was passed may be closed, too.
+        torch thread. Records that an earlier process left in the journal are written to the store;
+        an engine that only reads leaves them there and does not know them. Rows that are not as
+        they were written are not raised: every part is verified then
+        (`EngineState.integrity_error`). If the newest version is damaged, the newest intact one
+        decides. Without an executor, unless it only reads, the call also waits until a retrain can
+        begin at once. If it raises, a store that it opened is closed; an `SqlStore` that was passed
+        may be closed, too.
 
         Parameters
         ----------
@@ -350,6 +352,9 @@ class DataEngine(AbstractContextManager["DataEngine"]):
             If the store does not exist, is not used, is damaged or cannot be read, if another
             engine owns the cell, or if this dengine cannot restore the newest version (in rare
             cases KeyError, ValueError or NotImplementedError).
+        Exception
+            What an object of yours raises that is loaded, or trained again because the store has
+            only the numbers of its traces.
         SettingError
             If an object of yours is missing or is another one than the engine had, if a `model` is
             given to an engine that has its own, if `trace` contradicts the stored `TraceSpec`, if
@@ -772,9 +777,11 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         `run` calls it after each part. In a loop of your own `decide` and `report` together do the
         same, but each takes a version that the executor has trained only one step further (the
         steps are test, store, put in force). A training that is not done is not waited for. Without
-        an executor a retrain that is due runs here, also with `brief`. In a product, newer versions
-        and corrections of the other cells are put in force, which are looked for once a second. If
-        a safe mode began or ended, an event is recorded, and `on_safe_mode` is called.
+        an executor a retrain that is due runs here, also with `brief`. Before a retrain begins,
+        also one in the executor, the call waits until the store has all labels; if it does not take
+        them in time, the retrain waits for a later call. In a product, newer versions and
+        corrections of the other cells are put in force, which are looked for once a second. If a
+        safe mode began or ended, an event is recorded, and `on_safe_mode` is called.
 
         Parameters
         ----------

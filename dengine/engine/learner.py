@@ -149,7 +149,8 @@ class Learner:
         too. The rule must be put right (`Feedback.remedy`) after it learned a wrong outcome: it is
         rebuilt, or all corrections that the store has by now are applied and it is rebuilt. This
         waits for a later call while the store lacks any record or has a fault. Before a correction
-        a retrain under way is ended (`end_training`); a model that cannot change its references is
+        a retrain under way is ended (`end_training`), and the store is checked against its ledger:
+        after a difference every part is verified. A model that cannot change its references is
         retrained here, or, if it is pinned, fitted again, and what that raises is raised. If the
         store fails meanwhile, that is logged and not raised, and a later call tries again.
         """

@@ -444,9 +444,10 @@ class BaselinePredictor(nn.Module):
         success probability, the label counts n_success and n_failure, and an embedding that is
         always empty, shape (0, 0). The reason is UNCERTAIN for VERIFY, otherwise CERTAIN. `part`
         has no effect, because a baseline knows nothing of parts. Raises ValueError for an unknown
-        action, for other than one value of each, and for counts that are not whole numbers from 0
-        to 2**63 - 1 (OverflowError for an infinite count). Errors of the baseline are raised as
-        they are, and bounds are not checked.
+        action, for other than one value of each bound or count, and for counts that are not whole
+        numbers from 0 to 2**63 - 1 (OverflowError for an infinite count). Of several actions the
+        first counts; without one IndexError is raised. Errors of the baseline are raised as they
+        are, and bounds are not checked.
         """
         X = x.numpy()[None]
         (lower,), (upper,) = self.model.predict_interval(X)

@@ -939,10 +939,12 @@ def near_repeats(traces: Floats, parts: NDArray[np.int64]) -> int:
 
 
 def repeats_note(traces: Floats, parts: NDArray[np.int64]) -> str:
-    """Return a note for the report of a retrain if `near_repeats` counts many traces, else "".
+    """Return a note for the report of a retrain if many traces nearly repeat another, else "".
 
-    It takes the arguments of `near_repeats`: traces (n, C, T), and `parts`, the hash of the part of
-    each. More than 25 traces (`MANY_REPEATS`) are many.
+    The note advises to give the parts' numbers, because parts seem to have come twice without one.
+    It takes the arguments of `near_repeats`, which counts such traces among the newest 500: traces
+    (n, C, T), oldest first, and `parts`, the hash of the part of each, or the content hash if the
+    part is unknown. More than 25 traces (`MANY_REPEATS`) are many; fewer than 100 traces have none.
     """
     n_repeats = near_repeats(traces, parts)
     if n_repeats <= MANY_REPEATS:

@@ -76,7 +76,7 @@ def reducer_class(name: str) -> type:
 
 
 def make_reducer(name: str, **params: Any) -> Any:
-    """Make a reducer, which is not fitted yet.
+    """Make a reducer, which is not fitted yet; importing a user's module runs its code.
 
     Parameters
     ----------
@@ -95,9 +95,9 @@ def make_reducer(name: str, **params: Any) -> Any:
     Raises
     ------
     SettingError
-        If there is no such name, module or class, or it is no scikit-learn transformer; if a
-        parameter is unknown, or a value does not pass the check. What the constructor of
-        `module:Class` raises is raised as it is.
+        If there is no such name, module or class, the module cannot be imported, or it is no
+        scikit-learn transformer; if a parameter is unknown, or a value does not pass the check.
+        What the constructor of `module:Class` raises is raised as it is.
     """
     cls = reducer_class(name)
     allowed = signature(cls).parameters

@@ -94,8 +94,9 @@ class ProbabilityReducer(Reducer):
         """Return a module that can be compiled before the training on traces X (n, C, T).
 
         It is `module()` if the reducer is initialised. Otherwise it is the module of a clone that
-        is initialised for X, and this reducer stays as it is. Raises the errors of `check_traces`
-        and `_initialize`.
+        is initialised for X, and this reducer stays as it is. None if TorchScript cannot compile
+        it, which is logged once. If the reducer is initialised, X is not looked at; otherwise the
+        errors of `check_traces` and `_initialize` are raised.
         """
         if self.is_initialized_:
             return self.module()

@@ -301,9 +301,12 @@ class UmapReducer(Reducer):
     def n_epochs_due(self, n_traces: int) -> int:
         """Return the number of epochs that the next `train` takes on `n_traces` traces.
 
-        It is `n_epochs` if that was given. Otherwise it is the number of epochs that are missing to
-        the first 200; if none is missing, it is 240,000 / n_traces but at least 60. In both cases
-        it is at most 200, and at most 400,000 / n_traces but at least 1.
+        If `n_epochs` was given, it is that, without a limit. Otherwise it is the number of epochs
+        that are missing to the first 200; if none is missing, it is 240,000 / n_traces but at least
+        60. Either of these numbers is then limited to 200, and to 400,000 / n_traces but at least
+        1; quotients are rounded down. `train` takes fewer if its `stop` ends it, and counts the
+        first 200 from 0 again if more than half of its traces are new or it gets no numbers. Before
+        the first training or `precompute` AttributeError is raised, unless `n_epochs` was given.
         """
         if self.n_epochs is not None:
             return self.n_epochs

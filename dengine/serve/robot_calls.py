@@ -143,8 +143,9 @@ class RobotCalls:
         Raises
         ------
         TraceError
-            For a part that was not begun, or is not among the newest `MAX_PARTS` any more; for a
-            piece that `as_samples` refuses, such as one without samples, or that has a list for
+            For a part that was not begun, is not among the newest `MAX_PARTS` any more, or was
+            decided on by `decide_added` since `begin`; for a piece that `as_samples` refuses, such
+            as one without samples, or that has a list for
             each channel; and for more than `MAX_SAMPLES` samples of the part. A refused piece is
             not added.
         ReportError

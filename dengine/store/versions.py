@@ -110,11 +110,13 @@ class VersionTable(CellTable):
     def insert(self, connection: sa.Connection, row: Row) -> int:
         """Insert the row of a retrain; return the number of its version. Nothing is committed.
 
-        The retrain gets the next number of the cell or its product; the product is then locked
-        until the transaction ends. If the version is not put in force (`accepted` of the row is
-        False), it keeps its number, and nothing else is done. Otherwise it gets the number after
-        the product's newest version if another cell of the product has taken its number, and the
-        states of older versions of cell and product that `keeps_state` does not keep are deleted.
+        `row["version"]` is the number that the caller wants for the version. The retrain, whose
+        number is another one, gets the next number of the cell or its product; the product is then
+        locked until the transaction ends. If the version is not put in force (`accepted` of the row
+        is False), it has the number wanted, and nothing else is done. Otherwise it gets the number
+        after the product's newest version if another cell of the product has taken the number
+        wanted, and the states of older versions of cell and product that `keeps_state` does not
+        keep are deleted.
         """
         number: int = row["version"]
         if row["accepted"]:

@@ -70,6 +70,7 @@ def times_of(table: Table, clock: Clock, form: TextForm) -> Times:
     Returns
     -------
     seconds : array of float64, shape (rows,)
+        Shape (1,) if there is no column, or if each has but one cell.
     start : float
         In seconds, from the zero of the clock: 1970 (UTC) for dates, midnight for times of day,
         and the sum over the columns.

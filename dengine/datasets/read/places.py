@@ -183,10 +183,11 @@ class LabelReader:
 
         `table` is the table of the recording, and `part` its part number. If the source is a
         listing, the key that was found in it is added to `used`, the set of keys found so far.
-        Words are compared exactly; a word that is stated as several of these has the first of these
-        meanings. Raises UnreadableError if there is no label, if rows of the listing contradict
-        each other, or if a word has no stated meaning, and DataError if `source.path` is no regular
-        expression with one group.
+        Words are compared exactly; a word that is stated for several meanings is good before bad,
+        and bad before not checked. Raises UnreadableError if there is no label, if rows of the
+        listing contradict each other, if the recording's own rows have different words while
+        `source.at` is "same", or if a word has no stated meaning, and DataError if `source.path` is
+        no regular expression with one group.
         """
         source = self.source
         meanings = source.meanings
