@@ -160,9 +160,9 @@ def _without_audits(counts: dict[str, int]) -> dict[str, int]:
 
 
 def _span_cell(name: str, span: "Span") -> str:
-    """Return the text of a field of a `Span`: a time, a number, or a share of wrong decisions with
-    its verdict.
+    """Return the text of a field of a `Span`: a time, a number, or a share of wrong decisions.
 
+    The text on a share also says whether it keeps to the tolerance, as in `_error_cell`.
     A `Span` has the counts over the newest decisions, or over all, and `name` names its field.
     "none was accepted" replaces the share of bad accepted parts if no part was accepted.
     """

@@ -230,7 +230,8 @@ class Corrections:
         ------
         StoreError
             If the store does not answer, another cell of the product stores a version meanwhile, or
-            the engine is closed, was opened for reading or before a fork.
+            the engine is closed, was opened for reading or before a fork. A change that was stored
+            before the error stays stored.
         """
         self._bring_up_to_date()
         if not self._live.pinned:

@@ -256,12 +256,13 @@ class TorchReducer(ProbabilityReducer):
     def _build(self, channels: int, samples: int, average: int, seed: int | None = None) -> None:
         """Build preprocessor and networks for traces of this shape, with initial weights.
 
-        Counters and the state of the optimiser are reset, and `is_initialized_` becomes False.
-        Scales, checkpoint, `encoder_` and `is_initialized_` are left to the caller. `average` is
-        the number of samples that are averaged to one. Without `seed` the seed comes from
-        `random_state`; torch's global generator keeps its state. Raises SettingError for a
-        parameter out of its range, fewer than 2 samples, or a network that does not give (B,
-        features).
+        The counts of steps, the loss, `why_no_module_` and the state of the optimiser are reset,
+        and `is_initialized_` becomes False. The caller then sets scales and weights of a
+        checkpoint, makes `encoder_`, the module that embeds, and sets `is_initialized_` to True.
+        `average` is the number of samples that are averaged to one. Without `seed` the seed comes
+        from `random_state`; torch's global generator keeps its state. Raises SettingError for a
+        parameter out of its range, fewer than 2 samples, or a network that `Members` refuses, like
+        one that does not give (B, features); of these only the last changes anything.
         """
         self.check()
         if samples < 2:
@@ -575,9 +576,11 @@ class TorchReducer(ProbabilityReducer):
         """Raise SettingError for a parameter out of its range.
 
         Integers are folds from 2 to 1000, batch_size of at least 2, steps and fit_steps of at least
-        1, shift of at least 0 (these four up to a million), and n_components, 1 or 2. learning_rate
-        is above 0, weight_averaging below 1, and no other number is negative or
-        infinite. checkpoint is a text or path; no file is looked at.
+        1, shift of at least 0 (these four up to a million), and n_components, 1 or 2. The other
+        numbers are learning_rate, weight_averaging, weight_decay, gain, noise and mixup. None of
+        them is negative, infinite or NaN; besides, learning_rate is not 0, and weight_averaging is
+        below 1. checkpoint is a text or path; no file is looked at. The other parameters are not
+        checked.
         """
         check_integers(
             self,

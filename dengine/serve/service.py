@@ -356,8 +356,9 @@ class CellService:
 
         `work` is called with the engine and with whether the future was cancelled. A cancelled
         future does not stop the work, but the result is dropped. After the work every iteration
-        over `changes` goes on, unless the work is `read_only`. Raises BusyError if the service is
-        closing, or if the queue is full; only a full queue is counted, in `busy`.
+        over `changes`, by which clients hear of changes, goes on, unless the work is `read_only`.
+        Raises BusyError if the service is closing, if the engine's thread has ended, or if the
+        queue is full; only a full queue is counted, in `busy`.
         """
         job = Job(Future(), work, read_only)
         if self._closing or not self._thread.is_alive():

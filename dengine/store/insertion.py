@@ -76,11 +76,11 @@ class RecordInsertion:
         not stored, becomes an event, "dead letter", which is also logged as an error. No two
         decisions among the records may have one id. A line stop of a part that had counted as good
         (`_is_late_stop`) corrects the label of that part, with an event, unless it is a failure
-        already. Return one pair (decision id, number) for each decision that has a label among the
-        records, unless that becomes a dead letter: the number of its first label, whether that is
-        new, was stored before, or is corrected by a late stop. A new label keeps a positive number
-        that is still free (`Database.insert`), and is quarantined (kept out of training) if its
-        decision is.
+        already; if the label was forgotten, the line stop becomes a dead letter. Return one pair
+        (decision id, number) for each decision that has a label among the records, unless that
+        becomes a dead letter: the number of its first label, whether that is new, was stored
+        before, or is corrected by a late stop. A new label keeps a positive number that is still
+        free (`Database.insert`), and is quarantined (kept out of training) if its decision is.
         """
         events = [record for record in records if isinstance(record, Event)]
         decisions = [record for record in records if isinstance(record, StoredDecision)]

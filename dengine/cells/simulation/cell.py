@@ -176,11 +176,11 @@ def _find_cause(conditions: Conditions, pushed: Push) -> str:
     """Return the cause of a failed insertion, one of `CAUSES` but "none".
 
     `conditions` are those that were drawn, and `pushed` is what came of them. If a missed grasp or
-    a wrong part was drawn, that is the cause. Debris that was drawn is the cause only if the part
-    stopped below the rim and at most `SLIP_MM` above the debris. Otherwise the cause is "slip" if
-    the part moved more than `SLIP_MM` in the gripper, and else where it stopped: "rim_contact" on
-    the rim of the hole or its chamfer, "stuck" at most `STUCK_MM` above its seat, "wedging" in
-    between.
+    a wrong part was drawn, that is the cause. Debris that was drawn is the cause if the part's tip
+    stopped below the rim of the hole and its chamfer, at most `SLIP_MM` above the debris. Otherwise
+    the cause is "slip" if the part moved more than `SLIP_MM` in the gripper, and else where its tip
+    stopped: "rim_contact" on the rim or its chamfer, "stuck" at most `STUCK_MM` above the seat,
+    "wedging" in between.
     """
     tip_mm = pushed.height_mm - conditions.extra_length_mm  # of the part's tip above the seat
     if conditions.fault in ("missed_grasp", "wrong_part"):

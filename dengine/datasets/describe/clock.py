@@ -55,7 +55,7 @@ def propose_clock(p: Proposal) -> None:
     `time.column` is set to `?`, with a note, if several columns may tell the time or a part of it,
     like a date or whole seconds that are the same in all rows of a recording; these are not looked
     for beside a clock whose cells tell the day. It is `?`, too, if no column may (`is_clock`), but
-    the columns have no names, or one is named `s`, which may be seconds or the path of the tool.
+    the columns have no names, or one is named `s`, which may be seconds or the tool's position.
     Otherwise, if no column may, it stays empty. Stated columns are kept; only their forms are
     found. Of a column that is set `time.format` may be `?` (`form_of`). Raises SettingError for a
     malformed `windows.trigger`.

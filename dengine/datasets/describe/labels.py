@@ -195,9 +195,9 @@ def words_of(p: Proposal, source: LabelSource, tables: Tables, parts: Words) -> 
     """Return the word of each recording that has one in a source, by its `Table.source`.
 
     `tables` has the table of each recording, and `parts` their part numbers. If a listing has
-    several rows for a recording, it is the word of the first. If no recording has a word, its
-    listing cannot be read, or its `path` is no regular expression with one group, DataError is
-    raised for the stated source; any other then gives an empty mapping.
+    several rows for a recording, it is the word of the first. If no recording has a word, also
+    because the source's listing cannot be read, or its `path` is no regular expression with one
+    group, DataError is raised for the stated source; any other then gives an empty mapping.
     """
     words = dict[str, str]()
     faults = list[Fault]()

@@ -89,8 +89,8 @@ def decode(content: bytes, stated: str) -> tuple[str, str]:
 
     The `stated` encoding is used unless it is "". Otherwise it is UTF-16 if the text begins with
     its byte order mark, else UTF-8, or cp1252 if UTF-8 fails. A byte order mark is left out. Raises
-    UnreadableError if the text is in none of them, and LookupError for a stated encoding that
-    Python does not know.
+    UnreadableError if the text is in none of them or contains a zero character, and LookupError for
+    a stated encoding that Python does not know.
     """
     is_wide = content[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
     encoding = stated or ("utf-16" if is_wide else "utf-8")
