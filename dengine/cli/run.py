@@ -206,8 +206,9 @@ def _simulated_cell(scenario: str, cycles: int, source: DataChoice, **others: An
 
     The `TraceSpec` is the simulation's own, or what the options of `source` state; rate, unit and
     names of channels that these leave out are then the simulation's, if the shape is the same. The
-    cell's seed depends on the number of decisions in the store, and in a product also on the cell,
-    so that no part comes twice. `scenario` says what changes in the course of the `cycles`; for an
+    function takes the engine, and returns the cell and its name. The cell's seed depends on the
+    engine's seed, on the number of decisions in the store, and in a product also on the cell, so
+    that no part comes twice. `scenario` says what changes in the course of the `cycles`; for an
     unknown one SettingError is raised when the cell is made. `others` are settings of other kinds
     of cell, and are ignored. Raises what `trace_spec_from` raises.
     """

@@ -455,7 +455,8 @@ class Description:
         """Return the description with exactly these columns as channels, in this order.
 
         Each must be in `[channels]`, whose settings stay, or else in `[ignored]`, which gives its
-        unit and keeps the column. Raises DataError for any other column.
+        unit. `[ignored]` stays as it is, so such a column is in both then; a channel that is not
+        among `columns` is dropped. Raises DataError for any other column.
         """
         channels = {column: Channel(unit) for column, unit in self.ignored.items()}
         channels |= self.channels
@@ -531,8 +532,8 @@ def _as_kind(kind: Any, value: Any, where: str) -> Any:
     `kind` is a type in `KINDS`: text, whole number, number, boolean, or whole number or text. A
     number or boolean becomes a text, as Python writes it (`True`, `nan`), if only a text is
     expected, and a whole number a float if a number is. Raises DataError for a value of another
-    type, and for a number that is not finite if a number is expected; `where` is the name of the
-    key in the message.
+    type; and, if a number is expected, for one that is not finite or too large for a float. `where`
+    is the name of the key in the message.
     """
     if value == UNKNOWN:
         return value

@@ -137,8 +137,8 @@ class Table:
         """Raise UnreadableError for the first row in which `is_bad` is True; if none is, return.
 
         is_bad : bool, shape (rows,). wanted : what was expected, for the message. name : the column
-        whose cell the message shows. The error has the line, if known, and the column, by `origin`
-        that of the file.
+        whose cell the message shows. The error has the line, if known, and the column: the one in
+        the file if `origin` has it, else `name`.
         """
         if is_bad.any():
             row = int(is_bad.argmax())

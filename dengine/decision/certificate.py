@@ -376,8 +376,9 @@ class Certificate:
 
         It gives the number of parts, the bound in per cent, rounded up, the confidence, and the
         tolerance or, with prices, the share up to which the decision pays. Nothing can be said if
-        the group is empty, if its `propensity` is 0 (`unknown` says why; of accepts the known stops
-        are excepted), or if the bound is 1. `which` describes the parts. With audits they are those
+        the group is empty, if its `propensity` is 0 (`unknown` says why; for accepts: nothing
+        beyond the line stops that are known), or if the bound is 1.
+        `which` describes the parts. With audits they are those
         that the model would `verb` ("accept", "reject"), and so many were audited; in shadow mode
         each was checked. `wrong` is "bad" or "good", what a wrongly decided part was.
         """

@@ -384,9 +384,9 @@ class MemberEvidence(nn.Module):
         the new sum is compared with the limit. Nothing happens if `times` is 0 or less.
 
         An alarm starts the safe mode (both sides are closed), or starts it anew during one, and
-        sets the sums of all detectors to 0. During a safe mode the reason stays that stands first
-        in `SafeMode`: a side that has not shown its tolerance yet stays the reason when novel
-        traces come on top.
+        sets the sums of all detectors to 0. During a safe mode the reason becomes the one of the
+        old and the new that stands first in `SafeMode`: a side that has not shown its tolerance yet
+        stays the reason if an alarm of novel traces follows.
         """
         if times <= 0:
             return

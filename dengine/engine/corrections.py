@@ -299,7 +299,8 @@ class Corrections:
         The policy is stored. A trained model goes on under it as a new version; before the first
         training no version is made. Earlier decisions keep their bounds. The call waits for labels
         that are on their way to the store. A training under way in the executor is discarded, and
-        begins again.
+        begins again; one that is done is put in force or dropped first. What other cells of the
+        product have stored is taken in first, too.
 
         The decision rule turns bounds into actions, and may learn from outcomes. It starts anew if
         alpha, lower_bound, interval, guarantee, stops or prices change. Under the guarantees

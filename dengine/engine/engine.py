@@ -453,8 +453,10 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         taken in before; if the store does not answer then, the retrain is lost. A second call does
         nothing, nor does one in a forked process. Records that only the database does not take stay
         in the journal. Records that the disk does not take are given up, and an error is logged; no
-        call has said that they are on disk. A store in memory stays open. Raises StoreError while
-        another thread uses the engine.
+        call has said that they are on disk. If the disk hangs, the store stays open, and no other
+        engine can own the cell until the process ends. With `replaying=True` this waits for the
+        disk and the database without a time limit. A store in memory stays open. Raises
+        StoreError while another thread uses the engine.
         """
         with self._exclusive:
             if self._outbox.is_usable:

@@ -210,9 +210,10 @@ class Feedback:
         """Update rule and references with the outcome of a part, and have its label recorded.
 
         `source` says where the label comes from. A trace with a fault updates neither. An exception
-        of the model or the rule is logged and not raised. The label of a rejected part that was
-        inspected becomes a reference and does not update the rule: which parts are inspected is
-        somebody's choice, and no sample. Every other label also tells the rule how many accepted
+        of the model or the rule is logged and not raised; if the rule raised, it is stale, and
+        every part is verified. The label of a rejected part that was inspected becomes a reference
+        and does not update the rule: which parts are inspected is somebody's choice, and no sample.
+        Every other label also tells the rule how many accepted
         parts went on unreported since the last label, and this count begins again at 0, even if the
         decision is from before the present rule and so does not update it. A part that was counted
         among them is subtracted from the number that its own label tells, which may make it -1.
@@ -266,9 +267,9 @@ class Feedback:
 
         A product is several cells whose labels have one sequence of numbers in the store. With or
         without a product, the rule first counts each check that has become overdue as a wrong
-        decision. The store is not asked: these are the numbers that came with the labels drained so
-        far. Labels of traces with a fault are passed over, and without a model that answers no
-        reference changes. Nothing is raised.
+        decision; if this fails, it is logged, and the rule is stale. The store is not asked: these
+        are the numbers that came with the labels drained so far. Labels of traces with a fault are
+        passed over, and without a model that answers no reference changes. Nothing is raised.
         """
         self._count_overdue()
         if not self._provisional:
@@ -293,9 +294,12 @@ class Feedback:
         """Update the rule with each decision whose check has become overdue, as with a wrong one.
 
         A check is overdue if `Policy.label_within` or more decisions followed, and it has no report
-        yet. Each decision is counted once; a decision with the bound (0, 1), which says nothing, or
-        from before the present rule began, is not counted. A failed update is logged, and the rule
-        is stale then. `LiveModel.overdue_to` becomes the newest number that was examined.
+        yet. Each is examined once (`LiveModel.count_overdue`): its id goes to `LiveModel.overdue`,
+        and it updates the rule as a failure if its lower bound is above 0, and as a success if its
+        upper bound is below 1; so it may update it twice. A decision with the bound (0, 1), which
+        says nothing, or from before the present rule began, is not counted. A failed update is
+        logged, and the rule is stale then. `LiveModel.overdue_to` becomes the newest number that
+        was examined; nothing changes if that is not larger than before.
         """
         label_within = self._settings.now.recipe.policy.label_within
         overdue_to = self._outbox.n_decisions - label_within

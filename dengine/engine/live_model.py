@@ -304,7 +304,9 @@ class LiveModel:
     def _read_outcomes(self, after: int) -> list[OutcomeRecord]:
         """Return the stored outcomes of labels after this number, checked against the ledger.
 
-        The ledger is the store's hash chain. A failed check sets the outbox's `integrity_error`,
+        They are this cell's, of decisions since the present rule began (`LabelTable.outcomes_since`
+        says which labels do not count). The ledger is the store's hash chain.
+        A failed check sets the outbox's `integrity_error`,
         after which every part is verified; the outcomes are returned all the same. Overdue checks
         are among them. For a rule that never learns nothing is read or checked, and the list is
         empty. Raises StoreError if the store cannot be read.

@@ -83,7 +83,8 @@ def find_clean_start(
 
     If `newest`, whose weights learned from the labels that `trained_on` names, saw no such label,
     it is returned. It is also returned if it begins anew with each training, like a baseline, or a
-    model of which a stored version does not hold the fit. Otherwise the newest stored version of
+    model that must be fitted again after loading, as its versions lack the fit. Otherwise
+    the newest stored version of
     the cell or its product that saw no such label is returned, as a new model with the rule of
     `template`; versions that are damaged or not kept, or whose loading or restoring raises
     StoreError for another reason, are passed over. If there is none, it is `template`, the

@@ -270,8 +270,9 @@ def _with_objects(
     `texts` are the store's settings, and `name` is the name of the store for messages. An object
     equal to the reducer that the recipe names is accepted and not used; so is a name, which is not
     compared here, and any reducer beside a model. Raises SettingError if an object is missing or
-    differs from the one that the store was made with, if a `model` is passed to an engine that has
-    its own, or if it lacks a method of `Model`.
+    differs from the one that the store was made with, if a `model` is passed to an engine that
+    trains the recipe's own model, or if it lacks a method of `Model`. A store that holds no
+    description of its object accepts any.
     """
     if "model" in texts and model is None:
         raise SettingError(
@@ -495,12 +496,12 @@ class SettingsInForce:
             )
 
     def save(self) -> None:
-        """Write the settings to the store; wait for it at most as long as its time limit.
+        """Write the settings to the store; with a journal, wait at most for the outbox's `limit`.
 
         If the store does not take them, or does not answer in time, the error is logged and
         `is_unsaved` is set, which a later success clears. Raises SettingError if another cell of
-        the product has settings that contradict these; then nothing is written, and `is_unsaved`
-        stays as it is.
+        the product has settings that contradict these, or a recipe of the two cannot be read; then
+        nothing is written, and `is_unsaved` stays as it is.
         """
         texts = self.now.to_store()
         try:

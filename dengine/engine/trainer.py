@@ -313,9 +313,9 @@ class Retrainer:
         A successor starts from the weights of the current model, or from scratch. `collect` returns
         the outcome; no other training may be under way. The training waits in the executor until a
         discarded one is done. Returns False, and begins nothing, if there is no executor, or if it
-        refuses work, or hangs with a discarded training. An executor that refuses work or hangs is
-        started again if it can be, and otherwise one that refuses work is given up; both are
-        logged.
+        refuses work, or hangs with a discarded training (is not done with it after 60 s). An
+        executor that refuses work or hangs is started again if it can be, and otherwise one that
+        refuses work is given up. Logged are the refusal, a restart that fails, and the giving up.
         """
         executor = self.executor
         if executor is None:

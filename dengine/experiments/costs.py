@@ -300,7 +300,8 @@ class CostCurve:
         """Return a DataFrame with a row for each policy that was played.
 
         Its columns are the guarantee, alpha and lower_bound of the policy and the fields of
-        `PolicyCost`: costs in the user's unit, and shares and error rates from 0 to 1. `chosen` is
+        `PolicyCost`: costs in the user's unit, and shares and error rates from 0 to 1. Of `bad` and
+        `good` each field is a column, like `bad_rate`. `chosen` is
         True for the policy that pays or may pay, if there is one. `reported` is False for the
         policies that were left behind, because they were dearer in earlier shuffles.
         """
@@ -431,9 +432,11 @@ def cost_curve(
 
     The candidate policies are replayed on shuffles of the recordings. While there are more than
     two, they play two shuffles (on the scores of one engine that checks every part, unless a
-    baseline plays), and the dearer half (of an odd number the larger half) is left behind; policies
-    that verified every part count as the dearest. Others are compared by their expected cost over
-    all shuffles so far. The last two play fresh shuffles, by which no policy was chosen.
+    baseline plays), and the dearer half (of an odd number the larger half, but of three one) is
+    left behind; policies that verified every part count as the dearest. All others are compared by
+    their expected cost over all shuffles so far. The last two, or the only one, play fresh
+    shuffles, by which no policy was chosen. A policy that needs more good parts than a shuffle has
+    is not tried.
 
     Parameters
     ----------
@@ -446,7 +449,8 @@ def cost_curve(
         Anything `Contender.load` takes. Guarantee (the rule by which a policy decides), alpha,
         lower_bound and prices of its policy are replaced. If its policy has no audits (checks of
         parts that the model is certain of) and stops="some", the guarantees "pooled" and "cost" get
-        an audit rate of 5 %, because they need outcomes of accepted parts.
+        an audit rate of 5 %, because they need outcomes of accepted parts. A rule of the user's own
+        keeps its guarantee, and a baseline plays "local" alone.
     alphas : sequence of float, default (0.1,)
         Values to try under the guarantee "local", or under a rule of the user's own.
     lower_bounds : sequence of float
@@ -468,14 +472,14 @@ def cost_curve(
     Returns
     -------
     curve : CostCurve
-        Its `policy` is None if no policy pays.
+        Its `policy` is None if no policy pays or may pay.
 
     Raises
     ------
     SettingError
         A price, a policy, or a number of repeats or cycles out of range; a check that is not
-        cheaper than an escape; recordings of one label, or too few for any policy. With `keep` also
-        for a reducer that cannot be hashed.
+        cheaper than an escape; a false reject that costs nothing; recordings of one label, or too
+        few for any policy. With `keep` also for a reducer that cannot be hashed.
     DataError
         A data set that cannot be read.
     StoreError

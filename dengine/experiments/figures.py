@@ -412,7 +412,7 @@ def _axis_labels(spec: TraceSpec) -> list[str]:
     """Return a label for the axis of each channel of traces with this `TraceSpec`: its name, and
     its unit in brackets if known.
 
-    A single channel without a name is called "trace".
+    A single channel without a name is called "trace", several are "channel 0" and so on.
     """
     names = spec.names if spec.columns or spec.channels > 1 else ["trace"]
     return [
@@ -537,8 +537,9 @@ def _draw_drift(figure: Any, data: Dataset, finite: NDArray[np.bool_], label: st
     each finite trace.
 
     The share begins at the end of the first tenth; a dotted line is the share in the whole set. A
-    tenth is at least one part. The mean is taken over the samples of the first channel; `label`
-    names this channel and its unit. `figure` is a Figure or SubFigure, and `finite` (n,) says which
+    tenth is at least one part. The mean is taken over the samples of the first channel, and its dot
+    has the colour of the part's label; `label` names this channel and its unit.
+    `figure` is a Figure or SubFigure, and `finite` (n,) says which
     of the n traces have no sample that is not finite.
     """
     import pandas as pd

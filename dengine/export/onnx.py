@@ -97,7 +97,8 @@ def export_onnx(
         If the engine audits (checks some parts that the model is certain of), has force limits or a
         decision rule other than that of the guarantee "local" with stops "some", or if a part is
         among the references more than once; the message names all of these that apply. Also if
-        nothing was trained yet; for a baseline; if the reducer, the interval or the rule cannot be
+        nothing was trained yet; for a baseline; if `trace` has another shape than the model's
+        traces; if the reducer, the interval or the rule cannot be
         exported; if the compiled decision and the reducer map a trace to different points; if the
         rule is stale, because an update of it failed; if the store was changed from outside; if the
         key cannot be read; if a package is missing; and if onnxruntime does not decide like the

@@ -121,7 +121,8 @@ def export_torchscript(
     Raises
     ------
     ExportError
-        If nothing was trained yet, for a baseline, if the reducer, the interval or the decision
+        If nothing was trained yet, for a baseline, if `trace` has another shape than the model's
+        traces, if the reducer, the interval or the decision
         rule cannot be compiled, if the compiled decision and the reducer map one of up to eight
         labelled traces to different points, if the rule is stale, because an update of it failed,
         if the store was changed from outside, and if the key cannot be read.

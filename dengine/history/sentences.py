@@ -192,10 +192,10 @@ def _explain_reason(decision: Decision, trace: TraceArray, circumstances: Circum
 
 
 def _limits_left(trace: TraceArray, circumstances: Circumstances) -> Iterator[str]:
-    """Yield each force limit of the policy of that time that a trace leaves, as text.
+    """Yield, as text, each force limit of the policy in `circumstances` that a trace does not keep.
 
-    They are checked again, one by one; there may be none now. Raises SettingError for a force limit
-    that does not fit the trace.
+    They are checked again, one by one; the trace may keep all of them. Raises SettingError for a
+    force limit that does not fit the trace.
     """
     x = torch.from_numpy(trace)
     for limits in circumstances.recipe.policy.force_limits:

@@ -580,8 +580,9 @@ class ModelPrediction(EngineModel):
         `y` is 1 for success, 0 for failure. The hash of the trace's content gives the fold and
         stands for the part. The reducer is not trained, and a full index drops its oldest
         reference. Samples are not checked: a NaN makes a reference of NaN. Returns self. Raises
-        ValueError if nothing was fitted, TraceError for a trace of another shape, and ReportError
-        for another label; also what `build_decider` raises, if no decider is kept.
+        ValueError if nothing was fitted, TraceError for a trace of another shape (another length is
+        fitted as `trace_spec.fit` says, if it can be), and ReportError for another label; also what
+        `build_decider` raises, if no decider is kept.
         """
         X = as_traces(np.asarray(x)[None], self.trace_spec)
         hash_ = int(content_hash(X)[0])
@@ -802,10 +803,10 @@ class ModelPrediction(EngineModel):
 
         The references must be finite, and the points to which the reducer maps `examples`, some
         training traces, must not be NaN. A reducer that is restored from the state of this one must
-        map `examples` to the same points within 1e-5 (`is_close`), each of two times; if a reducer
+        map `examples` to the same points within 1e-5 (`is_close`), twice in a row; if a reducer
         gives no state, it must do so itself. The points, divided by the scale of their embedding
-        space, are kept for `check_answers`. If restoring raises a StoreError, that is a defect;
-        other errors are raised.
+        space, are kept for `check_answers`, unless a reference is not finite. If restoring raises a
+        StoreError, that is a defect; other errors are raised.
         """
         if not np.isfinite(self.index.column("points")).all():
             return "the embedding of a reference is not finite"

@@ -490,8 +490,8 @@ def binary_labels(y: Any, n: int, name: str) -> Ints:
     Raises
     ------
     SettingError
-        If `y` is None, or its labels are of more than two classes, continuous, not finite, or not
-        n in number.
+        If `y` is None, or its labels are of more than two classes, continuous, not finite, not
+        in one column, or not n in number.
     """
     if y is None:
         raise SettingError(

@@ -397,8 +397,9 @@ class RocketReducer(ProbabilityReducer):
         class. `stop` and `numbers`, those of the labels, which must increase, are as in `train`.
 
         Head k starts from its last weights, and is fitted on the rows outside fold k of at most
-        4000 rows (`sample_rows`). `stop` may end each tower's Newton steps; in the first fit its
-        deadline leaves three. Components are new at the first fit, after every 20, and for at least
+        4000 rows (`sample_rows`). `stop` may end each tower's Newton steps; in the first fit
+        up to three are taken even after its deadline.
+        Components are new at the first fit, after every 20, and for at least
         1.5 times as many rows as the last ones. The heads of each `Tower` are written to `net_`,
         weighed to one logit. `towers_` and what a fit reports (`n_iter_`, most steps of a tower,
         and `holdout_losses_`, the log loss of each head on the rows of its fold) are replaced,
@@ -517,6 +518,7 @@ class RocketReducer(ProbabilityReducer):
     def _set_axes(self, f: Tensor) -> None:
         """Write the leading components of the first `Tower`, and the second coordinate, to `net_`.
 
+        The leading components are the ones whose products are features of the last tower.
         If there is a second coordinate, it is a sigmoid of the first component. Before the sigmoid
         the component is scaled to mean 0 and standard deviation 2 over the tower's features `f` (n,
         p). Its sign is changed if it would point against the second coordinate that `net_` had

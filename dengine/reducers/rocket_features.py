@@ -342,7 +342,7 @@ class RocketEncoder(nn.Module):
 
 
 def compute_raw_features(encoder: RocketEncoder, traces: Floats) -> Tensor:
-    """Compute the unscaled features of traces (n, C, T): float32 (n, P).
+    """Compute the unscaled features of traces (n, C, T): float32 (n, P), P features of each.
 
     Gradients are not switched off here. The encoder computes 32 traces at a time. The features of a
     trace are the same to the bit whatever other traces it comes with, since the last 32 are filled

@@ -303,7 +303,7 @@ class TorchReducer(ProbabilityReducer):
         of steps that are missing until training is complete. `labels` (n,) are 1 or 0, `folds` (n,)
         the folds; `numbers` is not read. Returns the points of the traces, float32 (n, d), row i in
         embedding space ``folds[i]``. Raises SettingError for fewer than two traces outside a fold;
-        `encoder_` and the counters stay then.
+        `encoder_` and the counts of steps stay then.
         """
         with torch.no_grad():
             x: Tensor = self.preprocessor_(torch.from_numpy(traces))

@@ -534,9 +534,10 @@ class UmapReducer(Reducer):
     def _check(self, X: ArrayLike, reset: bool) -> Floats:
         """Check traces and parameters, and return the traces as `check_traces` does.
 
-        Raises SettingError for a parameter out of its range, or too few traces. n_components must
-        be an integer from 1 to 100, n_neighbors from 2 to 1000, and there must be more traces than
-        either. min_dist is from 0 to 1, n_epochs an integer of at least 1 or None.
+        Raises SettingError for a parameter out of its range, or too few traces, and the errors of
+        `check_traces`. n_components must be an integer from 1 to 100, n_neighbors from 2 to 1000,
+        and there must be more traces than either. min_dist is from 0 to 1, n_epochs an integer from
+        1 to 10**6 or None.
         """
         traces = self.check_traces(X, reset=reset)
         check_integers(self, n_components=(1, 100), n_neighbors=(2, 1000))

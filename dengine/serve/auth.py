@@ -152,7 +152,8 @@ def names_this_machine(host: str) -> bool:
     """Return whether a request's `Host` header is localhost or a loopback address, with or without
     a port, in small or capital letters.
 
-    It is False for "" and for a malformed header, and for a web page of another site whose name was
+    It is False for "" and for brackets without an address; what stands behind the colon, and before
+    an `@`, is not checked. It is False as well for a web page of another site whose name was
     made to resolve to this machine (DNS rebinding): the browser sends that name as `Host`.
     """
     try:

@@ -237,7 +237,8 @@ class RobotCalls:
         Parameters
         ----------
         request : str
-            As `begin` returned it; "": of the newest `begin`.
+            As `begin` returned it; "": of the newest `begin`. With "" a second call does not find
+            the decision of the first: it gets the reason "not_recorded".
         part : str or int
             The part's number; "": none.
 
@@ -332,7 +333,8 @@ class RobotCalls:
         ------
         ReportError
             For a report that contradicts an earlier one, unless it is a line stop after a
-            confirmation; for a value that is no label; and for an invalid id.
+            confirmation; for any report if a person had the label forgotten; for a value that is no
+            label; and for an invalid id.
         """
         if decision_id == "":  # of an unrecorded VERIFY
             return False

@@ -287,7 +287,7 @@ class CellService:
             Also if the engine is closed, and if only the event cannot be stored; it is then missing
             for good.
         BusyError
-            If the queue is full or the service is closing.
+            If the queue is full, the service is closing, or the engine's thread has ended.
         """
         begin = time.monotonic()
         label = as_success(success)
@@ -490,8 +490,9 @@ class CellService:
         """Open the engine by `make`, run jobs until None comes out of the queue, and close it.
 
         This is the body of the engine's thread. `opened` gets the engine, or the exception that
-        `make` raised; the thread ends after such an exception. After each job that is not
-        `read_only` the iterations over `changes` go on.
+        `make` raised; the thread ends after such an exception. While the queue is empty, the engine
+        does its other work, like retrains (`_next_job`). After each job that is not `read_only`
+        and each finished retrain, every iteration over the service's `changes` yields True.
         """
         try:
             engine = make()

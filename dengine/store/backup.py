@@ -57,7 +57,7 @@ def backup_store(url: FilePath, out: FilePath) -> BackupReport:
     is in the copy. Damaged records of a journal are left out, and a record that contradicts the
     copy, or that its database refuses, becomes an event of kind "dead letter" there, which is also
     logged. The copy is written in full or not at all; it is not in WAL mode. The store and the
-    journals are only read, but a store that is not in WAL mode is set to it (`reading`).
+    journals are only read, but a store that is not in WAL mode is set to it.
 
     Parameters
     ----------

@@ -249,7 +249,7 @@ class Drainer:
                     self._changed.wait_for(lambda: self._calls or self._stopped, RETRY_SECONDS)
 
     def _wait_for_work(self) -> tuple[Future[Any], Callable[[], Any]] | None:
-        """Wait until there is a call, or until there are records and it is time to drain them.
+        """Wait until there is a call, `stop` was called, or it is time to drain records.
 
         To drain records is to copy them to the database. Return the oldest submitted call, which
         leaves the queue, or None if there is none. Records are drained DRAIN_SECONDS (0.25 s) after

@@ -402,7 +402,8 @@ class Journal:
         """Write the header, the first 256 bytes: MAGIC, then JSON, padded with zeros.
 
         The JSON has this process as the owner, the number of the records that the store has, the
-        offset behind them, and the newest ledger entry. Raise OSError if it cannot be written.
+        offset behind them, the newest ledger entry, and a CRC-32 of these fields. Nothing is
+        synced. Raise OSError if it cannot be written.
         """
         fields = {
             "owner": describe_process()[:60],

@@ -117,7 +117,8 @@ class JournalledStore(Outbox):
         If records are damaged or missing in the journal, an event DATA_LOST is stored, which is an
         alarm until a person acknowledges it, and an error is logged. Raise StoreError if the
         database fails, or another release wrote a record, and OSError if the journal cannot be
-        read; the records that were not copied then stay in the journal.
+        read; the records that were not copied then stay in the journal. Raise StoreError, too, if
+        the journal cannot be cleared.
         """
         since = ""
         for item in self.store.decisions.select(HistoryFilter(), limit=1):

@@ -300,7 +300,7 @@ class CellCheck:
         Fill `digests`, the digests of the ledger's entries, and `rows`, the number of rows read,
         and call `on_rows` with the number of rows just read. A database error is a fault, too, and
         not raised; after one, it is not checked whether decisions, traces and labels belong
-        together.
+        together. If the ledger itself cannot be read, all of `entries` count as lacking.
         """
         checks = [(table, self._check_rows(table)) for table in CHAINED]
         checks += [

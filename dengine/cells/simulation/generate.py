@@ -87,7 +87,7 @@ def save_insertions(
     insertions : sequence of SimulatedInsertion
         At least one.
     force : bool, default False
-        Replace a file that exists.
+        Replace a file that exists; never a database, a folder or a link.
 
     Returns
     -------
@@ -96,7 +96,7 @@ def save_insertions(
     Raises
     ------
     OutputError
-        If the file exists, without `force`, or cannot be written.
+        If the file exists, without `force`, or must not or cannot be written.
     """
     buffer = BytesIO()
     X = np.stack([insertion.trace for insertion in insertions])

@@ -149,7 +149,8 @@ class RtdeRecorder(AbstractContextManager["RtdeRecorder"]):
 
         An insertion that is not complete after `timeout` seconds, for example because the
         controller fell silent, is returned with NaN for the missing samples. If packages are
-        missing where it began, so that its start is unknown, all samples are NaN.
+        missing where it began, so that its start is unknown, all samples are NaN. If the controller
+        was restarted during an insertion, what came before is returned at once.
 
         Parameters
         ----------
@@ -213,7 +214,7 @@ class RtdeRecorder(AbstractContextManager["RtdeRecorder"]):
 
         Samples that did not come are NaN. All samples are NaN if packages are missing where the
         insertion began, so that its start is unknown, or if no insertion has begun. The recorder
-        then looks for the next one.
+        then looks for the next one; a trigger that is on begins none until it was off.
         """
         start = self._start
         first = self._first_time()

@@ -131,8 +131,8 @@ def may_be_labels(source: LabelSource, words: Names) -> bool:
 
     `words` has the word of each recording, or of each row of a listing. There must be 2 to 12
     different ones, and on average at least two recordings for each. If the source is named like a
-    verdict (`is_named_like_verdict`), the average does not matter, and one word is enough if it has
-    a meaning.
+    verdict (`is_named_like_verdict`), the average does not matter, and one word is enough if it is
+    known to mean good or bad.
     """
     words = [*words]
     n = len({*words})
@@ -168,8 +168,9 @@ def part_words(source: PartSource, tables: Tables) -> Words:
 def sources_of(p: Proposal, paths: Names) -> Iterator[LabelSource]:
     """Yield the sources that may hold the labels.
 
-    They come in this order: pairs of columns of listings among `p.others`, of which one may be the
-    key, since it has more different words than half of its rows, and the other may hold labels;
+    They come in this order: pairs of columns of listings among `p.others`, of which one may
+    name the recordings or parts (`key`), since it has more different words than half of its rows,
+    and the other may hold labels;
     regular expressions for the paths (if a file or a column is a part), of words like "ok" in them
     and of any words at fixed places; columns without another use that have one word in all rows of
     a recording; and lines above the header. A file that cannot be read as a listing is skipped.

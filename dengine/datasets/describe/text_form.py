@@ -162,8 +162,8 @@ def _head_lines(rows: Rows, width: int, stated: Stated) -> tuple[int, int]:
     The header is the last line with at least `width` cells, the number of columns. But if more than
     half of its words are units, and an earlier line is as wide, it is the line of the units, and
     the earlier one is the header. If the header has a unit among its names, or a name twice, and
-    the wide line before it has no empty cell, that may be the header. DataError is raised then,
-    unless the user stated the header in `stated`.
+    the wide line before it has no empty cell, the line before may be the header instead. DataError
+    is raised then, unless the user stated the header in `stated`, which is not looked up here.
 
     rows : the cells of the lines above the samples.
     """

@@ -40,13 +40,13 @@ def scale_of(unit: str) -> float:
 
     The units are s, sec, ms, us, µs, ns, min, h and d. Raises DataError for any other text.
     """
-    match = re.fullmatch(r"(\d*\.?\d*)\s*([^\d.]+)", unit.strip())
+    match = re.fullmatch(r"(\d+\.?\d*|\.\d+)?\s*([^\d.]+)", unit.strip())
     if not match or match[2] not in UNITS:
         raise DataError(
             f"Expected time.format to be a unit of time of {', '.join(UNITS)}, {ISO}, or a form "
             f"like %d.%m.%Y, got {unit!r}."
         )
-    return float(match[1].strip(".") or 1) * UNITS[match[2]]
+    return float(match[1] or 1) * UNITS[match[2]]
 
 
 def times_of(table: Table, clock: Clock, form: TextForm) -> Times:

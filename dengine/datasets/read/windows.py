@@ -93,7 +93,8 @@ def _listed(table: Table, times: Floats, description: Description, base: Path) -
     `times`. The rows are those from the start to before the end (less 1e-5 s, for rounding). A
     window has a fault if it overlaps an earlier one, has no samples, or goes beyond the recording
     by more than 1.5 steps of the stated rate (without one: at all); one without samples gets the
-    first row. Raises DataError if the listing or its times cannot be read.
+    first row. Raises DataError if the listing or its times cannot be read, and LookupError for an
+    encoding that Python does not know.
     """
     about = description.windows
     form = description.text
