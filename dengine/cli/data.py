@@ -255,10 +255,11 @@ def train(
     is stored, but never trained on. A store that has been used has its own recipe and seed: leave
     these options out, because other values are refused. Recordings are brought to the length of the
     store's traces. If there is a version, no label is new to it, and it lacks no training step,
-    nothing is trained. If training needs more time than the recipe's time budget, several retrains
-    follow each other. The exit code is 1 if a new version is dropped, or if training steps are
-    missing at the end, because ten retrains in a row had no time for a single step. If steps are
-    missing, and after Ctrl-C, which keeps what was imported, the same command continues there.
+    nothing is trained. Otherwise a version that a rollback pinned is released first. If training
+    needs more time than the recipe's time budget, several retrains follow each other. The exit code
+    is 1 if a new version is dropped, or if training steps are missing at the end, because ten
+    retrains in a row had no time for a single step. If steps are missing, and after
+    Ctrl-C, which keeps what was imported, the same command continues there.
     """
     from ..datasets.importing import import_labelled, in_form_of
     from ..engine.engine import DataEngine

@@ -478,6 +478,7 @@ class DataChoice:
     def load(self, description: Description | None = None) -> Dataset:
         """Load the data set, with a progress bar, and return it.
 
+        It has only the channels and samples that the options `--channels` and `--samples` ask for.
         Its notes, and the first three recordings that were left out, are printed to stderr, but not
         with `--json`. `description` is the description to read by; None takes the one that
         `describe` returns. Raises the errors of `load_dataset`: DataError if the data set cannot be

@@ -506,7 +506,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
             an ACCEPT or REJECT is on disk when this returns.
         timed_out : bool, default False
             The caller, who gave an id, does not wait any more and verifies the part. Record this
-            as VERIFY with `Reason.LATE`, without asking the model. If the trace or the store has a
+            as VERIFY with `Reason.LATE`, without asking the model. None of the steps above is
+            done, and rule and model learn nothing of it. If the trace or the store has a
             fault, this fault is the reason instead. Any thread may make this call, also while
             another thread uses the engine; it waits for the disk, but not for that thread. With a
             store in memory, and while no `TraceSpec` is in force, the VERIFY is not recorded.
@@ -520,8 +521,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         Raises
         ------
         TraceError
-            For a wrong shape, a first trace of less than 10 samples, an id that belongs to another
-            trace, and an invalid part number.
+            For a wrong shape, values that are no real numbers, a first trace of less than 10
+            samples, an id that belongs to another trace, and an invalid part number.
         SettingError
             For a first trace that the policy's force limits do not fit, and, while settings are
             saved, for a `TraceSpec` that contradicts that of another cell of the product.

@@ -58,8 +58,8 @@ class Peers:
 
         The first is 0 if there is no version that is newer than the one in force; a version that
         could not be put in force does not count. Raises StoreError if the store gives no answer in
-        time. In both cases the store need not be asked again (`is_look_due`) for the next
-        LOOK_SECONDS (1 s).
+        time. Whatever comes of it, the next look is due LOOK_SECONDS (1 s) after this one began
+        (`is_look_due`).
         """
         self._looked = self._clock()
         store = self._outbox.store

@@ -641,7 +641,8 @@ class Learner:
     def release(self, author: str) -> Change:
         """Let retrains replace a version again that a rollback pinned, and return the stored event.
 
-        The same model, with its rule, goes on as a new version. If that cannot be stored, or
+        The same model, with its rule, goes on as a new version, and the newest report is one of
+        this version. It is not checked that a version is pinned. If that cannot be stored, or
         another cell of the product stored a version meanwhile, StoreError is raised and nothing
         changes.
         """

@@ -343,9 +343,9 @@ class RocketReducer(ProbabilityReducer):
     def _initialize(self, traces: Floats) -> None:
         """Build the module `net_`, with kernels and the channels' scales from traces (n, C, T).
 
-        A channel's scale makes its samples have deviation 1. The classifier heads are 0. No label
-        is read. Earlier fits are discarded. Raises SettingError for a parameter out of its
-        range or fewer than 2 samples.
+        A channel is scaled so that its samples have the standard deviation 1. The classifier heads
+        are 0. No label is read. Earlier fits are discarded. Raises SettingError for a parameter out
+        of its range or fewer than 2 samples.
         """
         x = torch.from_numpy(traces)
         self.build(traces.shape[1], traces.shape[2], averaging(x))
