@@ -282,10 +282,10 @@ class Recipe:
         """Parse the recipe in the settings of a store, ``settings["recipe"]``, and return it.
 
         `settings` has texts by name. No class of a reducer is imported. The defaults of `radius`
-        and `retrain_every` stand in that class, so a store must have both, unless the reducer is a
-        name in `RECIPES`: else StoreError is raised, because the store is damaged. Raises
-        SettingError for a text that is no recipe, and KeyError if the settings have no recipe.
-        `where` is the recipe's name in errors.
+        and `retrain_every` are attributes of the class, so a store must have both, unless the
+        reducer is a name in `RECIPES`: else StoreError is raised, because the store is damaged.
+        Raises SettingError for a text that is no recipe, and KeyError if the settings have no
+        recipe. `where` is the recipe's name in errors.
         """
         recipe = cls.from_toml(settings["recipe"], where)
         missing = [name for name in ("radius", "retrain_every") if vars(recipe)[name] is None]

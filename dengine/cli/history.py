@@ -238,8 +238,9 @@ def explain(store: str, decision: str, neighbours: int, out: Out | None) -> None
     """Explain why a decision came out as it did.
 
     The decision is named by its id, as `dengine history STORE` lists it, by its part's number, or
-    by the word last, for the newest. If a part has several decisions that are no rejects, its
-    number is refused with exit code 1; the message has their ids. A decision that is not in the
+    by the word last, for the newest. If a part has several decisions that are no rejects, or
+    several rejects and nothing else, its number is refused with exit code 1; the message has their
+    ids. Only the newest 20 decisions on the part are looked at. A decision that is not in the
     store is refused, too, and so is one whose trace, or a neighbour's, is damaged. Counts, bound
     and action are shown as they were recorded. Neighbours are searched again with the version that
     decided, if the store still has it. The picture of --out shows the trace with its neighbours and

@@ -136,7 +136,8 @@ def print_result(
         The JSON document, which `--json` prints alone. Its values may be anything that
         `to_jsonable` takes: NaN and infinities are printed as null, and passwords of URLs are
         masked. The subcommand's name, as "verb", and, with `make_files`, the paths of the files
-        that were written, as "files", are added to it, in a copy.
+        that were written, as "files", are added to it, in a copy. If a file could not be written,
+        none is listed, not even those written before it.
     *parts : str or rich.Table
         What is printed without `--json`. A line for each file that was written follows.
     out : Out or None

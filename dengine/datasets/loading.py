@@ -72,6 +72,8 @@ def load_dataset(
         labels cannot, or the traces and labels do not fit together (`make_dataset`).
     SettingError
         If `windows.trigger` of the description, which cuts long recordings, is malformed.
+    ValueError
+        If the index of a DataFrame that a description describes is named like one of its columns.
     StoreError
         If the store in a SQLite file cannot be opened or read, or has traces of several shapes.
     """

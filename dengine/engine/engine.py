@@ -260,10 +260,13 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         The engine then decides bit for bit as before it was closed, with two exceptions: if the
         newest version is damaged, the newest intact one decides, and if the store differs from its
         ledger, every part is verified. A new cell of a product decides by the product's newest
-        version. It is called once, before the first decision, and waits for
-        the store without a time limit. If retrains run in the calling thread, it also waits until
-        the first retrain can begin without delay. Raises the errors of `LiveModel.resume` and
-        `Feedback.resume`; StoreError if the store cannot be read is one of them.
+        version. A model of which the store has only the numbers of its traces is trained on them
+        again; if one of these is damaged or missing, no model is in force. A thread may be started
+        that computes in advance for the next retrain. This method is called once, before the first
+        decision, and waits for the store without a time limit. If retrains run in the calling
+        thread, it also waits until the first retrain can begin without delay. Raises the errors of
+        `LiveModel.resume` and `Feedback.resume`; StoreError if the store cannot be read is one of
+        them.
         """
         settings = self._settings.now
         self._learner.resume(settings.recipe.policy.label_within, settings.policy_since)
@@ -308,7 +311,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         reading: bool = False,
         **options: Unpack[RunOptions],
     ) -> Self:
-        """Open a used store, and go on with the same version and the same decisions, bit for bit.
+        """Open a store that had an engine; go on with its version and decisions, bit for bit.
 
         The engine owns the cell until `close`, unless it only reads, and limits this thread to one
         torch thread. Records that an earlier process left in the journal are written to the store;
@@ -349,7 +352,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         Raises
         ------
         StoreError
-            If the store does not exist, is not used, is damaged or cannot be read, if another
+            If the store does not exist, had no engine, is damaged or cannot be read, if another
             engine owns the cell, or if this dengine cannot restore the newest version (in rare
             cases KeyError, ValueError or NotImplementedError).
         Exception

@@ -125,10 +125,10 @@ class Learner:
         """Start a thread that computes in advance what the next training needs; do not wait for it.
 
         These are above all the features of the traces in the training window. They are kept in the
-        model that the training starts from, which is first looked for in the store, without a time
-        limit, if labels were corrected (`_choose_start`); a failure is logged. Nothing is started
-        if the training window is empty, or if `wait_until_precomputed` has not waited for an
-        earlier thread yet.
+        model that the training starts from. If labels were corrected, this call first looks for
+        that model in the store, without a time limit (`_choose_start`). A failure is logged.
+        Nothing is started if the training window is empty, or if `wait_until_precomputed` has not
+        waited for an earlier thread yet.
         """
         if self._precomputed is not None or not len(self._window):
             return
@@ -537,9 +537,10 @@ class Learner:
     def _try_to_hear(self, peers: Peers, with_labels: bool = True) -> bool:
         """Take in what peers stored (`_hear_of_peers`); return whether the store gave an answer.
 
-        These are versions and corrections of the product's other cells, and with `with_labels` the
-        labels of all cells. If the store gave no answer, or this cell's labels could not be stored,
-        the result is False; this is logged, once until it answers again, and nothing is raised.
+        These are versions and corrections of the product's other cells, and the labels of all cells
+        if there is such news or with `with_labels`. If the store gave no answer, or this cell's
+        labels could not be stored, the result is False; this is logged, once until it answers
+        again, and nothing is raised.
         """
         failure = None
         try:
@@ -661,7 +662,9 @@ class Learner:
         the later labels, up to the training window's capacity, as its references. A difference from
         the ledger sets the outbox's `integrity_error`, and a damaged trace is reported by an event
         in the store. Once it is in force, new labels count from zero, since the version knows all
-        labels until now. A retrain that was requested before is not begun any more.
+        labels until now. A retrain that was requested before is not begun any more. If the next
+        training starts from another model, a thread begins to precompute for it; without an
+        executor this call waits for the thread.
 
         A baseline, which is fitted again, gets the labels as they count now, since it cannot take
         a label back. An exception as the model takes over the rule in force is logged.

@@ -498,9 +498,10 @@ class SettingsInForce:
     def save(self) -> None:
         """Write the settings to the store; with a journal, wait at most for the outbox's `limit`.
 
-        If the store does not take them, or does not answer in time, the error is logged and
-        `is_unsaved` is set, which a later success clears. Raises SettingError if another cell of
-        the product has settings that contradict these, or a recipe of the two cannot be read; then
+        A write that is committing gets 2 s more. If the store does not take them, or does not
+        answer in time, the error is logged and `is_unsaved` is set, which a later success clears; a
+        commit that was too slow may still happen. Raises SettingError if another cell of the
+        product has settings that contradict these, or a recipe of the two cannot be read; then
         nothing is written, and `is_unsaved` stays as it is.
         """
         texts = self.now.to_store()

@@ -242,7 +242,7 @@ class CostCurve:
     @property
     def sentence(self) -> str:
         """The verdict as sentences: the chosen policy, its cost with the interval, and, if it may
-        pay, how many more parts would show that it pays.
+        pay, how many more parts would show that it pays, unless these are too many (`missing`).
 
         They begin with "Nothing pays" if no policy pays or may pay. They also say if another policy
         is cheaper, but not significantly, and if the search was interrupted.
@@ -608,9 +608,10 @@ def _within_reach(
 ) -> tuple[list[Policy], list[str]]:
     """Return the policies to be tried, without repeats, and notes on why others are not tried.
 
-    Each policy is that of the contender with some settings, an item of `changes`. It is not tried
-    if its settings are refused, or if it needs more good parts before it can accept one
-    (`needed_parts`) than `n_good`, the number of good parts that a shuffle plays.
+    Each policy is that of the contender with some settings, an item of `changes`, which must hold
+    the `guarantee`. It is not tried if its settings are refused, or if it needs more good parts
+    before it can accept one (`needed_parts`) than `n_good`, the number of good parts that a shuffle
+    plays.
     """
     policies = []
     out_of_reach = []

@@ -83,12 +83,13 @@ def pool(frame: pd.DataFrame, replays: Sequence[Replay]) -> list[Row]:
     Returns
     -------
     rows : list of dict
-        Beside `CONDITION`, `replays` and `cycles`:
+        Beside `CONDITION`, `replays` (how many) and `cycles` (of all of them):
 
         - certain, accepted, rejected, false_positive and the other `COUNTS`: means per replay.
           `total_*`: their sums. `certain_sd` and `false_positive_sd`: standard deviations over the
           replays, NaN for one replay.
-        - precision, npv : computed from the sums over all replays. A mean over the replays would
+        - precision, npv : computed from the sums over all replays; NaN without such
+          decisions. A mean over the replays would
           weigh a replay that accepted three parts as much as one that accepted 300.
         - Times of retrains and decisions, the first certain cycle and savings: median, largest or
           mean, as `AGGREGATED` says.

@@ -351,9 +351,9 @@ def _check_decisions(onnx_model: OnnxModel, model: Any, spec: TraceSpec) -> None
     The noise has amplitudes from 0.01 to 100, and is clipped at 0.9 times the sensor's limit in
     `spec`, if there is one. Raises ExportError if a coordinate of an embedding differs by more than
     0.0001 times (1 + its absolute value), if the counts of good and bad labels together differ by
-    more than two, or if counts are equal but the action differs, or the two ends of the bound
-    together by more than 1e-6. The noise is always the same. Counts may differ, since a reference
-    may lie exactly at the radius.
+    more than two, or if counts are equal but the action differs, or the differences of the
+    two ends of the bound add up to more than 1e-6. The noise is always the same. Counts may differ,
+    since a reference may lie exactly at the radius.
     """
     rng = np.random.default_rng(0)
     shape = (N_CHECKED, spec.channels, spec.samples)

@@ -200,7 +200,8 @@ def _restore_thresholds(
     They are (accept, reject): a part was accepted if lower >= the first, rejected if 1 - upper >=
     the second. Labels of quarantined traces and of rejected parts that somebody inspected do not
     update the rule. The rule "local" with stops="some" learns nothing, so both thresholds are the
-    policy's lower bound. Of any other rule the result is None if `_restore_rule` returns None, or
+    policy's lower bound; but if the version stored the state of another rule, the result is None.
+    Of any other rule the result is None if `_restore_rule` returns None, or
     if the rule is no `MemberRule`: only rules of this class have thresholds. Raises SettingError
     like `_restore_rule`.
     """

@@ -241,13 +241,13 @@ def leave_one_out(problem: RidgeProblem, logits: Tensor, factors: Tensor) -> Ten
     logits : Tensor of float64, shape (K, n)
         Logits by the fitted heads.
     factors : Tensor of float64, shape (K, W + 1, W + 1)
-        Cholesky factors of the heads' Hessians.
+        Cholesky factors of the heads' Hessians, over W features and the intercept.
 
     Returns
     -------
     Tensor of float64, shape (K, n)
-        Exact to first order for rows that train the head, unless the divisor of the correction is
-        below 0.05, which is then taken; of no use for other rows.
+        Exact to first order for rows that train the head. The divisor of the correction is at
+        least 0.05; where it would be smaller, the logit is not exact. Of no use for other rows.
 
     References
     ----------

@@ -62,8 +62,9 @@ class Preprocessor(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         """Raw traces (B, C, T) -> averaged, standardised, with differences: (B, 2 * C, L).
 
-        Channel 2 c + 1 holds the differences of channel 2 c in time, of which the first is 0. All
-        values are clipped at ±8. L is T // `average`. If T is no multiple of `average`, the first
+        Channel 2 c + 1 holds the differences of channel 2 c in time, times `difference_scale`; the
+        first is 0. All values are clipped at ±8. Before `learn` nothing is scaled or shifted. L is
+        T // `average`. If T is no multiple of `average`, the first
         samples are left out.
         """
         x = self.standardise(self.average_samples(x))

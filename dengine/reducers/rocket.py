@@ -399,9 +399,10 @@ class RocketReducer(ProbabilityReducer):
         Head k starts from its last weights, and is fitted on the rows outside fold k of at most
         4000 rows (`sample_rows`). `stop` may end each tower's Newton steps; in the first fit
         up to three are taken even after its deadline.
-        Components are new at the first fit, after every 20, and for at least
-        1.5 times as many rows as the last ones. The heads of each `Tower` are written to `net_`,
-        weighed to one logit. `towers_` and what a fit reports (`n_iter_`, most steps of a tower,
+        The principal components are computed anew at the first fit, after every 20 fits, and if
+        there are at least 1.5 times as many rows as at the last time.
+        The heads of each `Tower` are written to `net_`, weighed to one logit. `towers_` and
+        what a fit reports (`n_iter_`, most steps of a tower,
         and `holdout_losses_`, the log loss of each head on the rows of its fold) are replaced,
         `n_fits_` grows, and with `numbers` the cache of features then has these traces alone.
         Returns the points of the traces, float32 (n, d), row i in embedding space ``folds[i]``,
@@ -615,8 +616,9 @@ class RocketReducer(ProbabilityReducer):
         """Restore what `get_state` returned, and return self; the parameters must be the same.
 
         Afterwards the cache of features is empty. Raises SettingError for a parameter out of its
-        range, StoreError if the sizes do not follow from the parameters, and KeyError if the shape,
-        the counters (of fits, traces and steps) or the losses (log loss of each space) are missing.
+        range, StoreError if an array of `net_` is missing or the sizes do not follow from the
+        parameters, ValueError if a `Tower` lacks an array, and KeyError if the shape, the counters
+        (of fits, traces and steps) or the losses (log loss of each space) are missing.
         After an error the fitted model is lost.
         """
         channels, samples = self.restore_shape(state)

@@ -185,7 +185,7 @@ class RocketEncoder(nn.Module):
         return scaled.clamp_(-self.feature_clip, self.feature_clip)
 
     def average_samples(self, x: Tensor) -> Tensor:
-        """Raw traces (B, C, T) -> averaged traces (B, C, L), with channels of one scale.
+        """Raw traces (B, C, T) -> averaged traces (B, C, L), scaled by `scale` and `shift`.
 
         If T is no multiple of `average`, the first samples are left out. The scaled values are
         clipped at ±1e6.
@@ -295,7 +295,8 @@ class RocketEncoder(nn.Module):
         `scale`, which must be set before. `rng` draws the kernels: MiniRocket's for tower 1, normal
         weights less their mean for tower 2. It writes `kernel`, `threshold` and, if there are
         groups, `competing_kernel`. Thresholds, which only tower 1 has, are quantiles of the
-        outputs, from 5 to 95 %. A kernel of tower 1 gets a ramp two standard deviations of its
+        outputs, from 5 to 95 %. A kernel of tower 1 is scaled so that the ramp around
+        its threshold, on which its answer rises from 0 to 1, is two standard deviations of its
         outputs wide; those of tower 2 are scaled so that all outputs of a dilation have the
         deviation 1.
         """

@@ -266,8 +266,9 @@ class Guard:
         """Raise HTTPException for a request that is not allowed.
 
         The checks are, in this order: a request to a server without tokens must call it localhost
-        or by a loopback address (421); `_check_token` checks the token (401, 403), and sets the
-        context variable `CURRENT_TOKEN` to it; a request that may change something must not come
+        or by a loopback address (421); `_check_token` checks the token (401, 403; /healthz needs
+        none), and sets the context variable `CURRENT_TOKEN` to it, or to `ANYBODY` on a server
+        without tokens; a request that may change something (not GET, HEAD or OPTIONS) must not come
         from a web page of another site, by its headers Origin and Sec-Fetch-Site (403); and the
         announced length of the body must be at most `MAX_BODY` (413), 1 MiB. A token in the path is
         removed from `scope`.

@@ -150,7 +150,8 @@ class DecisionTable(CellTable):
         Returns
         -------
         list of str
-            Decisions on quarantined traces (stored, but never used in training) are left out.
+            Decisions on quarantined traces (stored, but never used in training) are left out. A
+            decision whose label was forgotten has a label.
         """
         return [
             row.id

@@ -73,8 +73,8 @@ class DecisionIndex:
 
         `entry` holds the record. The newest N_RECENT decisions (1,000) stay in `recent`. If the
         record is a label, its decision there is replaced by a copy with the label, without the
-        label's number and time. An event, and a decision that a later record replaces, change
-        nothing. Raise KeyError for a label that was not added.
+        label's number and time. An event changes nothing, nor does a decision if another with the
+        same id was added after it. Raise KeyError for a label if none of its decision waits.
         """
         record = entry.record
         if isinstance(record, StoredDecision) and not self.is_replaced(entry):

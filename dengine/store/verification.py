@@ -381,7 +381,8 @@ class CellCheck:
 
         `digests` gets the digest of each entry, hexadecimal, oldest first. An entry must fit the
         digest of the entry before, and the sums of its rows as they are stored: that a row does not
-        fit its sum is a fault of its own. After an entry that was changed, only this entry is a
+        fit its sum is a fault of its own. All rows must be checked first (`_check_rows`).
+        After an entry that was changed, only this entry is a
         fault. Only the first 20 missing entries are yielded; those behind the newest that an entry
         or a row names cannot be noticed.
         """

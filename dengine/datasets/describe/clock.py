@@ -52,13 +52,13 @@ ANSWERS = (  # to a clock that the reader would refuse
 def propose_clock(p: Proposal) -> None:
     """Find the column of times and its form, and set `time.column` and `time.format` in `p`.
 
-    `time.column` is set to `?`, with a note, if several columns may tell the time or a part of it,
-    like a date or whole seconds that are the same in all rows of a recording; these are not looked
-    for beside a clock whose cells tell the day. It is `?`, too, if no column may (`is_clock`), but
-    the columns have no names, or one is named `s`, which may be seconds or the tool's position.
-    Otherwise, if no column may, it stays empty. Stated columns are kept; only their forms are
-    found. Of a column that is set `time.format` may be `?` (`form_of`). Raises SettingError for a
-    malformed `windows.trigger`.
+    `time.column` is set to `?`, with a note, if several columns may tell the time (`is_clock`), or
+    one may and others a part of it, like a date or whole seconds that are the same in all rows of a
+    recording; these are not looked for beside a clock whose cells tell the day. It is `?`, too, if
+    no column may, but the columns have no names, or one is named `s`, which may be seconds or the
+    tool's position. Otherwise, if no column may, it stays empty. Stated columns are kept; only
+    their forms are found. Of a column that is set `time.format` may be `?` (`form_of`). Raises
+    SettingError for a malformed `windows.trigger`.
     """
     clocks = [column for column in p.columns.values() if is_clock(column)]
     if is_stated := "time.column" in p.stated:
