@@ -629,9 +629,9 @@ def _error_cell(error: ErrorRate) -> str:
     """Return how many decisions were wrong, like "3 of 120", and in a second line the interval of
     their share in percent, like "0.5 to 7.1 %".
 
-    The ends have two significant digits. It is "-" if there was no decision.
+    The ends have three significant digits. It is "-" if there was no decision.
     """
     if not error.decided:
         return "-"
-    interval = f"{100 * error.lower:.2g} to {percent(error.upper, '.2g')}"
+    interval = f"{amount(100 * error.lower)} to {amount(100 * error.upper)} %"
     return f"{error.wrong} of {error.decided}\n{interval}"

@@ -384,8 +384,9 @@ class Description:
         return "\n".join(lines) + "\n"
 
     def _lines(self, prefix: str, table: Stated) -> list[str]:
-        """Return the lines of one section of the TOML file; the note on a key stands above it.
+        """Return the lines of one section of the TOML file, without its heading.
 
+        The note on a key stands above it.
         Notes on keys that the section does not have come first. Empty notes are left out; a
         control character becomes a blank.
 

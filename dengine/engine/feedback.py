@@ -159,8 +159,9 @@ class Feedback:
         `stored` is the decision with the label that it has so far, if any. If the same report comes
         again before its label is known to be on disk (`note_synced`), nothing is done. If the
         decision has a label already, ReportError is raised, with one exception: a line stop may
-        follow the confirmation of a part by the next decision (`Policy(stops="all")`). Such a line
-        stop is recorded, and learned later, as a correction. The attribute `remedy` is set if the
+        follow the confirmation of a part, by a report or by the next decision
+        (`Policy(stops="all")`). Such a line stop
+        is recorded, and learned later, as a correction. The attribute `remedy` is set if the
         rule must be rebuilt, which is not done here. An exception of rule or model is logged, not
         raised.
 
@@ -183,9 +184,10 @@ class Feedback:
     def _take_in_new(self, stored: StoredDecision, success: bool) -> None:
         """Learn a label that is no repetition, and hand it to the outbox.
 
-        `stored` is the decision with the label that it has so far. If the next decision had
-        confirmed the part as good, a line stop is recorded but not learned yet, and `remedy`, which
-        says what must be done later, is set to CORRECT. It is set to REBUILD_RULE, unless it is set
+        `stored` is the decision with the label that it has so far. If a
+        report or the next decision had confirmed the part as good (CONFIRMED), a line stop is
+        recorded but not learned yet, and `remedy`, which says
+        what must be done later, is set to CORRECT. It is set to REBUILD_RULE, unless it is set
         already, if the rule had counted the part's check as overdue. Raises ReportError if the
         decision has any other label; then nothing is changed.
         """

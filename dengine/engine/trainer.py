@@ -380,7 +380,8 @@ class Retrainer:
         `wait` seconds, and a training that is not done then is given up. So is, whatever `wait` is,
         a training that hangs, or whose executor died. The outcome of a training that was given up
         or failed has no model and says why. An executor that died or hangs is started again if it
-        can be, or not used. `begin` of the outcome is now minus the duration of the training. How
+        can be. Otherwise retrains run without it: from then on if it died, else until it is free.
+        `begin` of the outcome is now minus the duration of the training. How
         long the training took for its last step and the work after it is remembered: the longest of
         the newest 20 is reserved in the budget of the next.
         """

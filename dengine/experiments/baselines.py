@@ -104,7 +104,8 @@ class Baseline(ABC):
         """Learn one trace `x` (C, T) with its label `y`, 1 for success, and return self.
 
         Any other label is a failure. Nothing is learned or checked before a training has succeeded;
-        nothing is learned if the method learns only in `fit`. The cached prediction is dropped.
+        nothing is learned if the method learns only in `fit`. The prediction that is kept of the
+        last traces is dropped.
         Raises TraceError for values that are no trace. It is not checked here that the trace is as
         long as those of the training.
         """

@@ -661,8 +661,10 @@ def _screen(
 ) -> Iterator[Replay]:
     """Yield a replay of each policy for each seed; its recipe has the policy.
 
-    A contender is replayed in shadow mode, and the rule of each policy decides on its predictions
-    (`replay_policy`). A baseline has no such predictions: each policy has a replay of its own.
+    dengine is replayed once for each seed, in shadow mode and with the force limits of the
+    contender's recipe. The rule of each policy decides on its predictions (`replay_policy`); force
+    limits of `policies` are not applied. A baseline has no such predictions: each policy has a
+    replay of its own. Policies vary fastest. `play` plays tasks and yields their replays.
     """
     if contender.baseline is not None:
         yield from play(_tasks(contender, policies, seeds, cycles))

@@ -433,10 +433,11 @@ def explained_picture(explanation: Explanation) -> Figure:
     """Draw the trace of a decision with its neighbours and the envelope; return the figure.
 
     The envelope is the band in which 95 % of the successes lie at each sample. Samples that are
-    outside by more than a tenth of its width are shaded. The picture has a panel for each of at
+    outside by more than a tenth of its width are shaded, but not one that
+    stands alone. The picture has a panel for each of at
     most four channels, in their order: those with the most shaded samples, of equal ones the first.
     Without an envelope only the traces are drawn, of the first four channels. The title has
-    the decision, its reason, the version and the label.
+    the decision's id, action and reason, the version and the label.
     """
     stored = explanation.decision
     decision = stored.decision

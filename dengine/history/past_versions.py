@@ -246,7 +246,8 @@ def load_rule(store: SqlStore, policy: Policy) -> DecisionRule | None:
     StoreError
         If the store cannot be read.
     SettingError
-        If an object of the user's class of rule cannot be made.
+        If an object of the user's class of rule cannot be made. An error of its constructor
+        other than TypeError is raised as it is.
     ValueError
         For a stored setting that must be a number and is none.
     """

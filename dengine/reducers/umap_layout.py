@@ -93,8 +93,8 @@ def leading_eigenvectors(
 
     They belong to the n largest eigenvalues after the very largest. Returns them as columns,
     float64 (n_traces, n), in the order of increasing eigenvalues, or None if the solver does not
-    converge. `rng` draws the vector from which the solver starts; up to 200 traces (or 4 n) all
-    eigenvectors are computed instead, without `rng`.
+    converge. `rng` draws the vector from which the solver starts; up to 200 traces (4 n, if that
+    is more) all eigenvectors are computed instead, without `rng`.
     """
     root = np.sqrt(np.asarray(graph.sum(1), dtype=np.float64)).ravel()
     edges = graph.tocoo()

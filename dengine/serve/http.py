@@ -238,7 +238,9 @@ class HttpApi:
         /correct makes a forgotten label count again. If the id of one decision is unknown (404), a
         decision has no label, or no id is given (422), no label is forgotten. 422 also for a
         request without an author, unless the token has a name, and for an author that is not the
-        token's. If a rollback pinned the version in force, and this version was trained with one of
+        token's, is longer than 200 characters or not printable. The certificate goes on to count a
+        forgotten outcome of a certain decision, as wrong. In the reason each run of white space
+        becomes a space. If a rollback pinned the version in force, and this was trained with one of
         the labels, it is released, so that retrains may replace it. A training under way begins
         again, even if the labels are forgotten already. 503: the queue is full, the store does not
         answer, or the trace of a decision is damaged.

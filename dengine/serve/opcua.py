@@ -279,8 +279,8 @@ class AddressSpace:
 
         An event is sent if the alarm has changed (`write_status`). If the status cannot be read or
         written, a warning is logged, and the variables keep their values with the OPC UA status
-        code UncertainLastUsableValue, which marks them as old; LastRefused is not touched. Nothing
-        is raised.
+        code UncertainLastUsableValue, which marks them as old; the variable LastRefused, which is
+        not part of the status, is not touched. Nothing is raised.
         """
         try:
             await self.write_status(await self._calls.status())

@@ -135,7 +135,7 @@ def _stamp_of(message: Any) -> int:
 
 
 def _cells_of(messages: list[tuple[int, Any]], logs: Cells, is_verdict: bool) -> Cells:
-    """Return the column of a topic, which has a message or None for each row of the channels.
+    """Return the column of a topic, which has the data of a message or None for each row.
 
     In each row stands the newest message so far, None before the first. But if `is_verdict`, the
     messages are labels, and each stands only in the last row that is not later than it; of several

@@ -119,7 +119,7 @@ def _dates(table: Table, name: str, unit: str, clock: Clock) -> Times:
     or like "%d.%m.%Y"; a comma is read as a point. Dates without a time zone are in `clock.zone`,
     or UTC if that is empty; times in the hour that comes twice need rows from both, in order.
     Raises UnreadableError if there is no column `name`, or one of its cells does not have the form,
-    or is no single time because clocks are changed.
+    or is no single time because clocks are changed, or if the cells have several offsets from UTC.
     """
     import pandas as pd
 

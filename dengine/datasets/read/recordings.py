@@ -195,6 +195,8 @@ def read_recordings(
         `make_dataset` refuses the traces, like those with more channels than samples.
     SettingError
         If `windows.trigger` is malformed.
+    ValueError
+        If the index of the DataFrame is named like one of its columns.
     """
     check_description(description)
     faults: list[Fault] = []
