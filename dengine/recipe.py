@@ -199,10 +199,12 @@ class Recipe:
 
     @property
     def user_classes(self) -> list[str]:
-        """The `module:Class` of its reducer and then of its decision rule, if they are the user's.
+        """The user's own classes as `module:Class`: the reducer's, then the decision rule's.
 
-        Classes of dengine and names like "conv" or "local" are left out, so the list may be empty.
-        A reducer that is an object is named if `to_toml` writes it as `module:Class`.
+        The decision rule is `policy.guarantee`. Classes below `dengine.reducers` and names like
+        "conv" or "local" are left out, so the list may be empty; a class elsewhere in dengine
+        counts as the user's. A reducer that is an object is named if `to_toml` writes it as
+        `module:Class`.
         """
         return [
             name
@@ -257,8 +259,8 @@ class Recipe:
         Settings that are missing get their defaults, and "none" is read as None, but not in
         [policy], which has no None. The policy's "windows", the name in earlier versions, is read
         as "force_limits". No class is imported, so an unknown reducer or `module:Class` is not
-        noticed here. Raises SettingError for text that is not TOML, an unknown key or a
-        value out of range. `where` is the recipe's name in errors.
+        noticed here. Raises SettingError for text that is not TOML, an unknown key or a value out
+        of range. `where` is the recipe's name in errors.
         """
         # tomllib raises ValueError for huge integers, too.
         with instead(SettingError, f"{where} is not TOML", ValueError, RecursionError):

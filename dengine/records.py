@@ -385,8 +385,8 @@ def as_success(value: Any, owner: str = "") -> bool:
     ----------
     value : object
         A bool, Python's or NumPy's, or a real number or 0-d array that is exactly 1 or 0. Nothing
-        else, such as a text, None or NaN, is guessed at:
-        `bool("NG")` is True, and -1 is what some controllers call true.
+        else, such as a text, None or NaN, is guessed at: `bool("NG")` is True, and -1 is what some
+        controllers call true.
     owner : str
         Whose label it is, for the error: "decision 1a2b".
 

@@ -258,8 +258,8 @@ def train(
     nothing is trained. Otherwise a version that a rollback pinned is released first. If training
     needs more time than the recipe's time budget, several retrains follow each other. The exit code
     is 1 if a new version is dropped, or if training steps are missing at the end, because ten
-    retrains in a row had no time for a single step. If steps are missing, and after
-    Ctrl-C, which keeps what was imported, the same command continues there.
+    retrains in a row had no time for a single step. If steps are missing, and after Ctrl-C, which
+    keeps what was imported, the same command continues there.
     """
     from ..datasets.importing import import_labelled, in_form_of
     from ..engine.engine import DataEngine

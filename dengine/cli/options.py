@@ -160,8 +160,8 @@ class CommaList(click.ParamType[Any]):
 def bundle_options(into: str, make: Callable[..., Any], options: Mapping[str, Option]) -> Option:
     """Return a decorator that adds options and hands them to the subcommand as one argument.
 
-    The subcommand's other arguments reach it unchanged. The help lists the options in their order
-    here. What `make` raises is raised before the subcommand begins.
+    The subcommand's other arguments, passed by name, reach it unchanged. The help lists the options
+    in their order in `options`. What `make` raises is raised before the subcommand begins.
 
     Parameters
     ----------

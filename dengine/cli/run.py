@@ -160,10 +160,10 @@ def _drive(
 
     A change has the `cycle` after which safe mode began or ended, and its `reason`, "" if it ended.
 
-    It ends after `cycles` parts, or after the current one at Ctrl-C or SIGTERM; a second Ctrl-C
-    ends it at once, without its last cycle, and a second SIGTERM ends the process. If the cell
-    fails, its CellError is returned and not raised; other errors are raised. When safe mode begins
-    or ends, a line is printed to stderr, unless `--json`.
+    The run ends after `cycles` parts, or after the current one at Ctrl-C or SIGTERM; a second
+    Ctrl-C ends the run at once, without its last cycle, and a second SIGTERM ends the process. If
+    the cell fails, its CellError is returned and not raised; other errors are raised. When safe
+    mode begins or ends, a line is printed to stderr, unless `--json`.
     """
     from ..experiments.replay import ObservedCycle, observe_cycles, to_replay
 

@@ -162,9 +162,9 @@ def _without_audits(counts: dict[str, int]) -> dict[str, int]:
 def _span_cell(name: str, span: "Span") -> str:
     """Return the text of a field of a `Span`: a time, a number, or a share of wrong decisions.
 
-    The text on a share also says whether it keeps to the tolerance, as in `_error_cell`.
-    A `Span` has the counts over the newest decisions, or over all, and `name` names its field.
-    "none was accepted" replaces the share of bad accepted parts if no part was accepted.
+    A `Span` has the counts over the newest decisions, or over all, and `name` names its field. The
+    text on a share also says whether it keeps to the tolerance, as in `_error_cell`; it is "none
+    was accepted" for the share of bad accepted parts if no part was accepted.
     """
     value = getattr(span, name)
     if name in ("first", "last"):
@@ -178,10 +178,10 @@ def _error_cell(estimate: "ErrorEstimate") -> str:
     """Return a text on a share of wrong decisions: counts, interval, verdict.
 
     The verdict says whether the share keeps to the tolerance, is beyond it, or may be beyond it
-    (open). Without known outcomes the counts are left out. If the interval then begins at 0 (no
-    line stop is known either) and the verdict is open, the text only says that nothing is known.
-    The interval is rounded outward to 0.1 %. `estimate` has the interval, and the outcomes that it
-    is computed from.
+    (open). If the interval rests on no outcomes (`n_known` is 0), the counts are left out; if it
+    then also begins at 0 and the verdict is open, the text is "none is known". Known line stops
+    alone can raise its lower end above 0. The interval is rounded outward to 0.1 %. `estimate` has
+    the interval, the verdict, and the counts of the outcomes.
     """
     if not estimate.n_known and not estimate.lower and estimate.verdict == "open":
         return "none is known"

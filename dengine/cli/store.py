@@ -449,9 +449,9 @@ def import_labels(journal: Path, store: str, any_model: bool) -> None:
     imported; a label that contradicts the store's is counted, but not stored. Under the policy
     --stops all, an accepted part without a report is imported as good, unless it is the last part.
     If a line was changed or is missing, the lines before it are imported, the others are not, and
-    the exit code is 1. A file that is no journal, has no accepted or labelled part, has a
-    line that cannot be read, or belongs to another model (unless --any-model, or the store records
-    no export) is refused as a whole. The subcommand is refused while an engine runs on the cell.
+    the exit code is 1. A file that is no journal, has no accepted or labelled part, has a line that
+    cannot be read, or belongs to another model (unless --any-model, or the store records no export)
+    is refused as a whole. The subcommand is refused while an engine runs on the cell.
     """
     from ..export.cell_journal import import_journal
 

@@ -67,8 +67,8 @@ def check_text(text: TextForm) -> None:
 
     Python must know the encoding. The delimiter and the decimal mark must be one character each.
     The decimal mark and the mark of thousands, which may be "", must differ, and be no digit, sign,
-    e or E; the delimiter is not compared with them.
-    `text.data`, the line of the first samples, must be 1 or more.
+    e or E; the delimiter is not compared with them. `text.data`, the line of the first samples,
+    must be 1 or more.
     """
     with instead(DataError, "Expected an encoding in text.encoding", LookupError, ValueError):
         "".encode(text.encoding)  # also refuses codecs that are of no text

@@ -386,9 +386,8 @@ class Description:
     def _lines(self, prefix: str, table: Stated) -> list[str]:
         """Return the lines of one section of the TOML file, without its heading.
 
-        The note on a key stands above it.
-        Notes on keys that the section does not have come first. Empty notes are left out; a
-        control character becomes a blank.
+        The note on a key stands above it. Notes on keys that the section does not have come first.
+        Empty notes are left out; a control character becomes a blank.
 
         prefix : the name of the section with a dot, like `label.`, with which the keys of its notes
         begin; "" for the keys outside of all sections. table : the values of the section by key.
@@ -580,7 +579,7 @@ def flat(prefix: str, value: Mapping[str, Any]) -> dict[str, Any]:
 
     An empty mapping within it is left out. If two keys become equal, the later one counts.
 
-    prefix : text that is put before each key. value : the mapping.
+    prefix : text that is put before each key as it is, without a dot. value : the mapping.
     """
     items: dict[str, Any] = {}
     for name, item in value.items():

@@ -293,10 +293,10 @@ def _as_stored(
     """Return a record of a decision and a copy of its trace (C, T), without storing it.
 
     Its propensity, the probability of a check, is the policy's audit rate (1 in shadow mode) if the
-    model was certain, else 1. `checked` is what a `TraceGate` returned for the trace: its fault
-    (0 if it has none) and its content hash. A fault becomes the reason of the decision,
-    whose propensity stays, and the record is marked as
-    quarantined. `time` is that of the decision, seconds since 1970.
+    model was certain, else 1. `checked` is what a `TraceGate` returned for the trace: its fault (0
+    if it has none) and its content hash. A fault becomes the reason of the decision, whose
+    propensity stays, and the record is marked as quarantined. `time` is that of the decision,
+    seconds since 1970.
     """
     fault, content = checked
     made = replace(

@@ -293,10 +293,10 @@ def _read_store(path: Path) -> Dataset:
     """Return the labelled traces of a store, in the order of their labels, corrections applied.
 
     The labels are those of the store's cell and of the other cells of its product. Quarantined
-    traces and forgotten labels are left out. So is a trace that is missing or not as it was
-    stored, and an event is written to the store, or logged if that fails.
-    If several traces are of one part, `part` is the hash by which
-    the store counts them as one part; otherwise it is None. The store is closed.
+    traces and forgotten labels are left out. So is a trace that is missing or not as it was stored,
+    and an event is written to the store, or logged if that fails. If several traces are of one
+    part, `part` is the hash by which the store counts them as one part; otherwise it is None. The
+    store is closed.
 
     Raises DataError if the store has no labelled traces, or if its rows contradict its ledger, the
     chain of hashes over them. Raises StoreError if the store cannot be opened or read, and if its

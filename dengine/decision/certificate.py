@@ -377,10 +377,10 @@ class Certificate:
         It gives the number of parts, the bound in per cent, rounded up, the confidence, and the
         tolerance or, with prices, the share up to which the decision pays. Nothing can be said if
         the group is empty, if its `propensity` is 0 (`unknown` says why; for accepts: nothing
-        beyond the line stops that are known), or if the bound is 1.
-        `which` describes the parts. With audits they are those
-        that the model would `verb` ("accept", "reject"), and so many were audited; in shadow mode
-        each was checked. `wrong` is "bad" or "good", what a wrongly decided part was.
+        beyond the line stops that are known), or if the bound is 1. `which` describes the parts.
+        With audits they are those that the model would `verb` ("accept", "reject"), and so many
+        were audited; in shadow mode each was checked. `wrong` is "bad" or "good", what a wrongly
+        decided part was.
         """
         parts = counted(group.n, "part")
         but = " beyond the known stops" if verb == "accept" else ""

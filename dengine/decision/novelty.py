@@ -264,7 +264,7 @@ def _noise_floor(gate: NoveltyGate, x: Tensor) -> Tensor:
     steps = torch.zeros(x.size(1))
     if n_samples > 1:
         steps = torch.linalg.vector_norm(torch.diff(x), dim=2).median(0).values
-    # Of the segments first and second differences, then three of brief stretches.
+    # In the order of `plain_features`: first and second differences of segments, then brief ones.
     brief = [2 * gate.brief, gate.brief, gate.brief]
     lengths = torch.tensor([*2 * gate.segments * [gate.length], *brief])
     return (0.05 * (lengths / n_samples).sqrt() * steps[:, None]).clamp(min=1e-12)

@@ -64,7 +64,7 @@ class Candidate:
         self.is_stored = False
         self._previous = previous
         self._clock = clock
-        self._begin = trained.begin  # of the retrain, as if all time since were work on it
+        self._begin = trained.begin  # of the retrain, put off by the time that is no work on it
         self._work_ended = clock()
 
     def begin_work(self) -> None:

@@ -458,8 +458,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         in the journal. Records that the disk does not take are given up, and an error is logged; no
         call has said that they are on disk. If the disk hangs, the store stays open, and no other
         engine can own the cell until the process ends. With `replaying=True` this waits for the
-        disk and the database without a time limit. A store in memory stays open. Raises
-        StoreError while another thread uses the engine.
+        disk and the database without a time limit. A store in memory stays open. Raises StoreError
+        while another thread uses the engine.
         """
         with self._exclusive:
             if self._outbox.is_usable:
@@ -508,12 +508,12 @@ class DataEngine(AbstractContextManager["DataEngine"]):
             An id that the caller chooses. The same id and trace always have the same decision, and
             an ACCEPT or REJECT is on disk when this returns.
         timed_out : bool, default False
-            The caller, who gave an id, does not wait any more and verifies the part. Record this
-            as VERIFY with `Reason.LATE`, without asking the model. None of the steps above is
-            done, and rule and model learn nothing of it. If the trace or the store has a
-            fault, this fault is the reason instead. Any thread may make this call, also while
-            another thread uses the engine; it waits for the disk, but not for that thread. With a
-            store in memory, and while no `TraceSpec` is in force, the VERIFY is not recorded.
+            The caller, who gave an id, does not wait any more and verifies the part. Record this as
+            VERIFY with `Reason.LATE`, without asking the model. None of the steps above is done,
+            and rule and model learn nothing of it. If the trace or the store has a fault, this
+            fault is the reason instead. Any thread may make this call, also while another thread
+            uses the engine; it waits for the disk, but not for that thread. With a store in memory,
+            and while no `TraceSpec` is in force, the VERIFY is not recorded.
 
         Returns
         -------

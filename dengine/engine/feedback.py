@@ -160,10 +160,9 @@ class Feedback:
         again before its label is known to be on disk (`note_synced`), nothing is done. If the
         decision has a label already, ReportError is raised, with one exception: a line stop may
         follow the confirmation of a part, by a report or by the next decision
-        (`Policy(stops="all")`). Such a line stop
-        is recorded, and learned later, as a correction. The attribute `remedy` is set if the
-        rule must be rebuilt, which is not done here. An exception of rule or model is logged, not
-        raised.
+        (`Policy(stops="all")`). Such a line stop is recorded, and learned later, as a correction.
+        The attribute `remedy` is set if the rule must be rebuilt, which is not done here. An
+        exception of rule or model is logged, not raised.
 
         A label that is learned counts as new and enters the training window; in a product it does
         so later, from the store. The label of a trace with a fault is only recorded. The part waits
@@ -184,12 +183,11 @@ class Feedback:
     def _take_in_new(self, stored: StoredDecision, success: bool) -> None:
         """Learn a label that is no repetition, and hand it to the outbox.
 
-        `stored` is the decision with the label that it has so far. If a
-        report or the next decision had confirmed the part as good (CONFIRMED), a line stop is
-        recorded but not learned yet, and `remedy`, which says
-        what must be done later, is set to CORRECT. It is set to REBUILD_RULE, unless it is set
-        already, if the rule had counted the part's check as overdue. Raises ReportError if the
-        decision has any other label; then nothing is changed.
+        `stored` is the decision with the label that it has so far. If a report or the next decision
+        had confirmed the part as good (CONFIRMED), a line stop is recorded but not learned yet, and
+        `remedy`, which says what must be done later, is set to CORRECT. It is set to REBUILD_RULE,
+        unless it is set already, if the rule had counted the part's check as overdue. Raises
+        ReportError if the decision has any other label; then nothing is changed.
         """
         decision = stored.decision
         source = source_of(decision, success)
@@ -215,10 +213,10 @@ class Feedback:
         of the model or the rule is logged and not raised; if the rule raised, it is stale, and
         every part is verified. The label of a rejected part that was inspected becomes a reference
         and does not update the rule: which parts are inspected is somebody's choice, and no sample.
-        Every other label also tells the rule how many accepted
-        parts went on unreported since the last label, and this count begins again at 0, even if the
-        decision is from before the present rule and so does not update it. A part that was counted
-        among them is subtracted from the number that its own label tells, which may make it -1.
+        Every other label also tells the rule how many accepted parts went on unreported since the
+        last label, and this count begins again at 0, even if the decision is from before the
+        present rule and so does not update it. A part that was counted among them is subtracted
+        from the number that its own label tells, which may make it -1.
 
         The label takes the next number of the outbox. The label of a trace without a fault counts
         as new and enters the training window; in a product it is read into that from the store,
@@ -341,9 +339,9 @@ class Feedback:
         of a safe mode that began, or "" if it ended; then the event says `reason_ended`. A safe
         mode begins after an alarm of the rule. If another alarm changes the reason of a safe mode,
         it is announced once more, as one that began. What changed and changed back between two
-        calls is not announced. If recording the event or the user's function fails,
-        that is logged and not tried again; callers do this only after labels are stored, so that
-        such a failure costs no label.
+        calls is not announced. If recording the event or the user's function fails, that is logged
+        and not tried again; callers do this only after labels are stored, so that such a failure
+        costs no label.
         """
         safe_mode = self._live.newest.safe_mode
         if safe_mode == self._safe_mode:

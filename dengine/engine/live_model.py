@@ -305,12 +305,11 @@ class LiveModel:
         """Return the stored outcomes of labels after this number, checked against the ledger.
 
         They are this cell's, of decisions since the present rule began (`LabelTable.outcomes_since`
-        says which labels do not count). The ledger is the store's hash chain.
-        A failed check sets the outbox's `integrity_error`,
-        after which every part is verified; the outcomes are returned all the same. All overdue
-        checks are among them, whatever `after` is.
-        For a rule that never learns nothing is read or checked, and the list is
-        empty. Raises StoreError if the store cannot be read.
+        says which labels do not count). The ledger is the store's hash chain. A failed check sets
+        the outbox's `integrity_error`, after which every part is verified; the outcomes are
+        returned all the same. All overdue checks are among them, whatever `after` is. For a rule
+        that never learns nothing is read or checked, and the list is empty. Raises StoreError if
+        the store cannot be read.
         """
         if not self.newest.rule_learns:
             return []

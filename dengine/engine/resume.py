@@ -57,7 +57,7 @@ def restore_model(
     store = outbox.store
     first = int(trained_on.seq[0])
     last = int(trained_on.seq[-1])
-    outbox.check_integrity(first - 1)  # of the newest labels alone it was checked
+    outbox.check_integrity(first - 1)  # only the newest labels were checked before
     data = store.labels.with_traces(first=first, last=last, corrected_to=trained_on.corrected_to)
     kept = np.isin(data.seq, trained_on.seq)
     corrected = {
@@ -83,12 +83,11 @@ def find_clean_start(
 
     If `newest`, whose weights learned from the labels that `trained_on` names, saw no such label,
     it is returned. It is also returned if it begins anew with each training, like a baseline, or a
-    model that must be fitted again after loading, as its versions lack the fit. Otherwise
-    the newest stored version of
-    the cell or its product that saw no such label is returned, as a new model with the rule of
-    `template`; versions that are damaged or not kept, or whose loading or restoring raises
-    StoreError for another reason, are passed over. If there is none, it is `template`, the
-    untrained model with its initial weights.
+    model that must be fitted again after loading, as its versions lack the fit. Otherwise the
+    newest stored version of the cell or its product that saw no such label is returned, as a new
+    model with the rule of `template`; versions that are damaged or not kept, or whose loading or
+    restoring raises StoreError for another reason, are passed over. If there is none, it is
+    `template`, the untrained model with its initial weights.
 
     Returns
     -------

@@ -420,9 +420,10 @@ def check_model_settings(reducer: Any, given: Settings) -> None:
     """Raise SettingError for settings that have no effect beside a model that is handed in.
 
     `reducer` is the setting of that name, and `given` holds the other settings by name; None is a
-    setting that was not given. Reducer, radius and folds have no effect. Of a policy only
-    `BASELINE_SETTINGS` have one (audit_rate, stops, label_within, force_limits and shadow): any
-    other field must be at its default. Settings of other names pass.
+    setting that was not given. Reducer, radius and folds have no effect and must not be given. In
+    `given["policy"]` only the fields in `BASELINE_SETTINGS` have an effect (audit_rate, stops,
+    label_within, force_limits and shadow); any other field must be at its default. Settings of
+    other names pass.
     """
     idle = [name for name in ("radius", "folds") if given.get(name) is not None]
     if reducer is not None:

@@ -134,7 +134,7 @@ class TrainingWindow:
 
 
 def _no_numbers() -> Ints:
-    """Return the numbers of no labels: an empty array."""
+    """Return an empty array of int64: the sequence numbers of the labels, if there are none."""
     return np.zeros(0, dtype=np.int64)
 
 
@@ -302,8 +302,9 @@ class Retrainer:
         newest 20 is reserved in the time budget of the next. This thread then has one torch thread.
         """
         data = self.window.snapshot()
-        limits = (self._step_seconds(), self.max_steps)
-        trained = train_candidate(current.successor(), data, *limits, self.clock)
+        trained = train_candidate(
+            current.successor(), data, self._step_seconds(), self.max_steps, self.clock
+        )
         self._last_seconds.append(trained.last_seconds)
         return replace(trained, begin=begin)
 
@@ -326,8 +327,7 @@ class Retrainer:
         data = self.window.snapshot()
         if not self._began:
             log.info("the first retrain begins, on %s", counted(len(data.seq), "label"))
-        limits = (self._step_seconds(), self.max_steps)
-        arguments = (current.successor(), data, *limits, self.clock)
+        arguments = (current.successor(), data, self._step_seconds(), self.max_steps, self.clock)
         try:
             self.future = executor.submit(train_candidate, *arguments)
         except RuntimeError as error:
@@ -381,9 +381,9 @@ class Retrainer:
         a training that hangs, or whose executor died. The outcome of a training that was given up
         or failed has no model and says why. An executor that died or hangs is started again if it
         can be. Otherwise retrains run without it: from then on if it died, else until it is free.
-        `begin` of the outcome is now minus the duration of the training. How
-        long the training took for its last step and the work after it is remembered: the longest of
-        the newest 20 is reserved in the budget of the next.
+        `begin` of the outcome is now minus the duration of the training. How long the training took
+        for its last step and the work after it is remembered: the longest of the newest 20 is
+        reserved in the budget of the next.
         """
         future = self.future
         left = self._count_seconds_left()
@@ -447,11 +447,11 @@ def train_candidate(
 
     The outcome has the model, a reason in words, the number of steps, the duration, and the numbers
     of the labels. `successor` is the model, which this changes in place. No step begins after
-    `step_seconds`, and after `max_steps` steps; None is no limit. Any exception, a window
-    without traces, and a defect of the trained model give an outcome without a model, whose reason
-    begins with "dropped: ". A training that reaches a limit ends early and is accepted; its reason
-    says so if the time budget ended it before its last step, and has the note of the model's report
-    if there is one. `clock` returns seconds. The modules that a training imports are loaded first;
+    `step_seconds` seconds or `max_steps` steps; None is no limit. Any exception, a window without
+    traces, and a defect of the trained model give an outcome without a model, whose reason begins
+    with "dropped: ". A training that reaches a limit ends early and is accepted; its reason says so
+    if the time budget ended it before its last step, and has the note of the model's report if
+    there is one. `clock` returns seconds. The modules that a training imports are loaded first;
     their time does not count, and a failure of this is logged. Sets the present thread to one torch
     thread. It is a plain function, so that any executor can run it.
     """

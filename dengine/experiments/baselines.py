@@ -105,9 +105,8 @@ class Baseline(ABC):
 
         Any other label is a failure. Nothing is learned or checked before a training has succeeded;
         nothing is learned if the method learns only in `fit`. The prediction that is kept of the
-        last traces is dropped.
-        Raises TraceError for values that are no trace. It is not checked here that the trace is as
-        long as those of the training.
+        last traces is dropped. Raises TraceError for values that are no trace. It is not checked
+        here that the trace is as long as those of the training.
         """
         self._last = None
         if self.is_trained:

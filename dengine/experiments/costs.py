@@ -301,9 +301,9 @@ class CostCurve:
 
         Its columns are the guarantee, alpha and lower_bound of the policy and the fields of
         `PolicyCost`: costs in the user's unit, and shares and error rates from 0 to 1. Of `bad` and
-        `good` each field is a column, like `bad_rate`. `chosen` is
-        True for the policy that pays or may pay, if there is one. `reported` is False for the
-        policies that were left behind, because they were dearer in earlier shuffles.
+        `good` each field is a column, like `bad_rate`. `chosen` is True for the policy that pays or
+        may pay, if there is one. `reported` is False for the policies that were left behind,
+        because they were dearer in earlier shuffles.
         """
         import pandas as pd
 
@@ -552,12 +552,12 @@ def find_policy(
             seed += N_SCREENING
     seeds = range(seed, seed + repeats)
     fresh = play(_tasks(contender, policies, seeds, n_cycles)) if is_whole else []
-    finished = [_finished(replays, policies) for replays in (fresh, screened)]
-    chosen = finished[0] or finished[1]
+    finished = _finished(fresh, policies)
+    chosen = finished or _finished(screened, policies)
     if not chosen:
         return None
     left_behind = tuple(row for policy, row in rows.items() if policy not in policies)
-    return curve_of(chosen, costs, left_behind, tuple(out_of_reach), fresh=bool(finished[0]))
+    return curve_of(chosen, costs, left_behind, tuple(out_of_reach), fresh=bool(finished))
 
 
 def _finished(replays: Iterable[Replay], policies: Sequence[Policy]) -> Groups:

@@ -285,8 +285,8 @@ def window_curves(replays: Sequence[Replay], window: int = WINDOW, fewest: int =
 def curves(by_recipe: Mapping[str, Sequence[Replay]], title: str = "") -> Figure:
     """Draw the paper's curves over a sliding window of cycles, in a colour for each key.
 
-    A key is a recipe with its replays, or a live run. Up to six keys have the
-    colours in `RECIPES`. More keys have 20 others, which the 21st key and those after it use again.
+    A key is a recipe with its replays, or a live run. Up to six keys have the colours in `RECIPES`.
+    More keys have 20 others, which the 21st key and those after it use again.
 
     The panels show, from the top: the share of certain decisions, those without a check, and its
     spread over the replays; the share of good parts among the accepted parts, and the policy's
@@ -433,11 +433,10 @@ def explained_picture(explanation: Explanation) -> Figure:
     """Draw the trace of a decision with its neighbours and the envelope; return the figure.
 
     The envelope is the band in which 95 % of the successes lie at each sample. Samples that are
-    outside by more than a tenth of its width are shaded, but not one that
-    stands alone. The picture has a panel for each of at
-    most four channels, in their order: those with the most shaded samples, of equal ones the first.
-    Without an envelope only the traces are drawn, of the first four channels. The title has
-    the decision's id, action and reason, the version and the label.
+    outside by more than a tenth of its width are shaded, but not one that stands alone. The picture
+    has a panel for each of at most four channels, in their order: those with the most shaded
+    samples, of equal ones the first. Without an envelope only the traces are drawn, of the first
+    four channels. The title has the decision's id, action and reason, the version and the label.
     """
     stored = explanation.decision
     decision = stored.decision
@@ -539,9 +538,9 @@ def _draw_drift(figure: Any, data: Dataset, finite: NDArray[np.bool_], label: st
 
     The share begins at the end of the first tenth; a dotted line is the share in the whole set. A
     tenth is at least one part. The mean is taken over the samples of the first channel, and its dot
-    has the colour of the part's label; `label` names this channel and its unit.
-    `figure` is a Figure or SubFigure, and `finite` (n,) says which
-    of the n traces have no sample that is not finite.
+    has the colour of the part's label; `label` names this channel and its unit. `figure` is a
+    Figure or SubFigure, and `finite` (n,) says which of the n traces have no sample that is not
+    finite.
     """
     import pandas as pd
 

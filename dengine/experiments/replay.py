@@ -72,10 +72,8 @@ COUNTED = (
     "safe_mode",
     "outside",
 )
-
-
 # Settings of a policy that are columns of tables.
-POLICY_COLUMNS: tuple[str, ...] = ("interval", "alpha", "lower_bound", "guarantee", "stops")
+POLICY_COLUMNS = ("interval", "alpha", "lower_bound", "guarantee", "stops")
 
 
 @dataclass(frozen=True)

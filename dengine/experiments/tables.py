@@ -88,9 +88,9 @@ def pool(frame: pd.DataFrame, replays: Sequence[Replay]) -> list[Row]:
         - certain, accepted, rejected, false_positive and the other `COUNTS`: means per replay.
           `total_*`: their sums. `certain_sd` and `false_positive_sd`: standard deviations over the
           replays, NaN for one replay.
-        - precision, npv : computed from the sums over all replays; NaN without such
-          decisions. A mean over the replays would
-          weigh a replay that accepted three parts as much as one that accepted 300.
+        - precision, npv : computed from the sums over all replays; NaN without such decisions. A
+          mean over the replays would weigh a replay that accepted three parts as much as one that
+          accepted 300.
         - Times of retrains and decisions, the first certain cycle and savings: median, largest or
           mean, as `AGGREGATED` says.
         - error_lower, error_upper : 95 % interval of the share of bad parts among the accepted
@@ -130,10 +130,10 @@ def promise_lines(rows: Sequence[Row]) -> list[str]:
     good?
 
     A row has replays with the same settings, counted together. LB is the lower bound of its policy.
-    The sentence ends with "kept" or "broken", or says
-    that no part, or too few parts, were accepted. It always names the recipe and the guarantee. It
-    names the interval and alpha only if the rows differ in it.
-    It has the share of good parts, and the interval of the share of bad parts.
+    The sentence ends with "kept" or "broken", or says that no part, or too few parts, were
+    accepted. It always names the recipe and the guarantee. It names the interval and alpha only if
+    the rows differ in it. It has the share of good parts, and the interval of the share of bad
+    parts.
     """
     varying = [name for name in ("interval", "alpha") if len({row[name] for row in rows}) > 1]
     lines = []

@@ -98,11 +98,11 @@ def export_onnx(
         decision rule other than that of the guarantee "local" with stops "some", or if a part is
         among the references more than once; the message names all of these that apply. Also if
         nothing was trained yet; for a baseline; if `trace` has another shape than the model's
-        traces; if the reducer, the interval or the rule cannot be
-        exported; if the compiled decision and the reducer map a trace to different points; if the
-        rule is stale, because an update of it failed; if the store was changed from outside; if the
-        key cannot be read; if a package is missing; and if onnxruntime does not decide like the
-        model. Other errors of torch and onnxruntime are raised as they are.
+        traces; if the reducer, the interval or the rule cannot be exported; if the compiled
+        decision and the reducer map a trace to different points; if the rule is stale, because an
+        update of it failed; if the store was changed from outside; if the key cannot be read; if a
+        package is missing; and if onnxruntime does not decide like the model. Other errors of torch
+        and onnxruntime are raised as they are.
     SettingError
         If the engine's force limits do not fit `trace`.
     OutputError
@@ -351,9 +351,9 @@ def _check_decisions(onnx_model: OnnxModel, model: Any, spec: TraceSpec) -> None
     The noise has amplitudes from 0.01 to 100, and is clipped at 0.9 times the sensor's limit in
     `spec`, if there is one. Raises ExportError if a coordinate of an embedding differs by more than
     0.0001 times (1 + its absolute value), if the counts of good and bad labels together differ by
-    more than two, or if counts are equal but the action differs, or the differences of the
-    two ends of the bound add up to more than 1e-6. The noise is always the same. Counts may differ,
-    since a reference may lie exactly at the radius.
+    more than two, or if counts are equal but the action differs, or the differences of the two ends
+    of the bound add up to more than 1e-6. The noise is always the same. Counts may differ, since a
+    reference may lie exactly at the radius.
     """
     rng = np.random.default_rng(0)
     shape = (N_CHECKED, spec.channels, spec.samples)

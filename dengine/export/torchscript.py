@@ -122,10 +122,10 @@ def export_torchscript(
     ------
     ExportError
         If nothing was trained yet, for a baseline, if `trace` has another shape than the model's
-        traces, if the reducer, the interval or the decision
-        rule cannot be compiled, if the compiled decision and the reducer map one of up to eight
-        labelled traces to different points, if the rule is stale, because an update of it failed,
-        if the store was changed from outside, and if the key cannot be read.
+        traces, if the reducer, the interval or the decision rule cannot be compiled, if the
+        compiled decision and the reducer map one of up to eight labelled traces to different
+        points, if the rule is stale, because an update of it failed, if the store was changed from
+        outside, and if the key cannot be read.
     SettingError
         If the engine's force limits do not fit `trace`.
     OutputError

@@ -201,9 +201,9 @@ def _restore_thresholds(
     the second. Labels of quarantined traces and of rejected parts that somebody inspected do not
     update the rule. The rule "local" with stops="some" learns nothing, so both thresholds are the
     policy's lower bound; but if the version stored the state of another rule, the result is None.
-    Of any other rule the result is None if `_restore_rule` returns None, or
-    if the rule is no `MemberRule`: only rules of this class have thresholds. Raises SettingError
-    like `_restore_rule`.
+    Of any other rule the result is None if `_restore_rule` returns None, or if the rule is no
+    `MemberRule`: only rules of this class have thresholds. Raises SettingError like
+    `_restore_rule`.
     """
     has_state = bool(arrays_with_prefix(stored.state, "rule."))
     if (policy.guarantee, policy.stops) == ("local", "some") and not has_state:

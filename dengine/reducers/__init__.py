@@ -116,8 +116,8 @@ def _check_parameter(default: Any, key: str, value: Any) -> None:
 
     The value must have the type of `default`; if that is a float, any number but NaN will do.
     `folds` must lie between 2 and 1000, any other integer within 32 bits. If the default is
-    neither str, int nor float, as None is, the value is not checked. Without the check, a
-    wrong value would make every retrain fail.
+    neither str, int nor float, as None is, the value is not checked. Without the check, a wrong
+    value would make every retrain fail.
     """
     integers = (2, 1000) if key == "folds" else (-MAX_INTEGER, MAX_INTEGER)
     checks = {

@@ -413,7 +413,8 @@ def as_rows(traces: Floats) -> Floats:
 def embed_in_chunks(module: Callable[[Tensor], Tensor], x: Tensor, size: int) -> Floats:
     """Embed the rows of x (n, ...) by a module, `size` rows at a time: float32 (n, K, d).
 
-    No gradients are kept, and n may be 0. The module is called in the mode that it is in.
+    No gradients are kept. If n is 0, the module is called once, with no rows. It is called in the
+    mode that it is in (training or evaluation), and must return float32 (rows, K, d) on the CPU.
     """
     return torch.cat([module(chunk) for chunk in torch.split(x, size)]).numpy()
 

@@ -122,14 +122,14 @@ def fit_heads(
     Head k, trained without the labels of fold k, minimises the sum of its log losses plus ``l2 / 2
     * |w| ** 2``; the ridge of the bias is nearly 0. This is convex, so a head ends at the same
     weights wherever it starts, unless the steps are limited. A step that raises the loss of a head,
-    ridge included, is halved; if six sizes of the step raise it, it is left out, and the head
-    ends unless its Hessian was an old one. A head has converged when its
-    next step would change no weight by
-    more than about 0.0002. The factor of its Hessian is used again after a step whose largest
-    change is at most a quarter of that of the step before, and at most 0.3. If the leave-one-out
-    loss of a head is above the loss of its base rate, the share of successes among its rows, the
-    head is replaced by the base rate; a head whose rows are all of one class stays. This is decided
-    for each head alone, since a common decision would let the labels of fold k choose head k.
+    ridge included, is halved; if six sizes of the step raise it, it is left out, and the head ends
+    unless its Hessian was an old one. A head has converged when its next step would change no
+    weight by more than about 0.0002. The factor of its Hessian is used again after a step whose
+    largest change is at most a quarter of that of the step before, and at most 0.3. If the
+    leave-one-out loss of a head is above the loss of its base rate, the share of successes among
+    its rows, the head is replaced by the base rate; a head whose rows are all of one class stays.
+    This is decided for each head alone, since a common decision would let the labels of fold k
+    choose head k.
 
     Parameters
     ----------

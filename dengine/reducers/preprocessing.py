@@ -64,8 +64,7 @@ class Preprocessor(nn.Module):
 
         Channel 2 c + 1 holds the differences of channel 2 c in time, times `difference_scale`; the
         first is 0. All values are clipped at ±8. Before `learn` nothing is scaled or shifted. L is
-        T // `average`. If T is no multiple of `average`, the first
-        samples are left out.
+        T // `average`. If T is no multiple of `average`, the first samples are left out.
         """
         x = self.standardise(self.average_samples(x))
         differences = (x[:, :, 1:] - x[:, :, :-1]) * self.difference_scale

@@ -397,16 +397,14 @@ class RocketReducer(ProbabilityReducer):
         class. `stop` and `numbers`, those of the labels, which must increase, are as in `train`.
 
         Head k starts from its last weights, and is fitted on the rows outside fold k of at most
-        4000 rows (`sample_rows`). `stop` may end each tower's Newton steps; in the first fit
-        up to three are taken even after its deadline.
-        The principal components are computed anew at the first fit, after every 20 fits, and if
-        there are at least 1.5 times as many rows as at the last time.
-        The heads of each `Tower` are written to `net_`, weighed to one logit. `towers_` and
-        what a fit reports (`n_iter_`, most steps of a tower,
-        and `holdout_losses_`, the log loss of each head on the rows of its fold) are replaced,
-        `n_fits_` grows, and with `numbers` the cache of features then has these traces alone.
-        Returns the points of the traces, float32 (n, d), row i in embedding space ``folds[i]``,
-        whose head did not see the label of row i.
+        4000 rows (`sample_rows`). `stop` may end each tower's Newton steps; in the first fit up to
+        three are taken even after its deadline. The principal components are computed anew at the
+        first fit, after every 20 fits, and if there are at least 1.5 times as many rows as at the
+        last time. The heads of each `Tower` are written to `net_`, weighed to one logit. `towers_`
+        and what a fit reports (`n_iter_`, most steps of a tower, and `holdout_losses_`, see the
+        class) are replaced, `n_fits_` grows, and with `numbers` the cache of features then has
+        these traces alone. Returns the points of the traces, float32 (n, d), row i in embedding
+        space ``folds[i]``, whose head did not see the label of row i.
         """
         raw = self.raw_features(traces, numbers)
         with torch.no_grad():
@@ -519,11 +517,10 @@ class RocketReducer(ProbabilityReducer):
     def _set_axes(self, f: Tensor) -> None:
         """Write the leading components of the first `Tower`, and the second coordinate, to `net_`.
 
-        The leading components are the ones whose products are features of the last tower.
-        If there is a second coordinate, it is a sigmoid of the first component. Before the sigmoid
-        the component is scaled to mean 0 and standard deviation 2 over the tower's features `f` (n,
-        p). Its sign is changed if it would point against the second coordinate that `net_` had
-        before.
+        The leading components are the ones whose products are features of the last tower. If there
+        is a second coordinate, it is a sigmoid of the first component. Before the sigmoid the
+        component is scaled to mean 0 and standard deviation 2 over the tower's features `f` (n, p).
+        Its sign is changed if it would point against the second coordinate that `net_` had before.
         """
         net = self.net_
         columns = net.encoder.towers[0]
@@ -598,8 +595,8 @@ class RocketReducer(ProbabilityReducer):
 
         They are the shape, the counters, the losses, the fields of each `Tower`, and the tensors of
         `net_`, whose names begin with "net.". The cache of features is not among them. Losses and
-        towers are not copies. Raises NotFittedError before there are kernels,
-        AttributeError before the first fit.
+        towers are not copies. Raises NotFittedError before there are kernels, AttributeError before
+        the first fit.
         """
         check_is_fitted(self, "net_")
         counts = [self.average_, self.n_fits_, self.n_component_traces_, self.n_iter_]
@@ -618,8 +615,8 @@ class RocketReducer(ProbabilityReducer):
         Afterwards the cache of features is empty. Raises SettingError for a parameter out of its
         range, StoreError if an array of `net_` is missing or the sizes do not follow from the
         parameters, ValueError if a `Tower` lacks an array, and KeyError if the shape, the counters
-        (of fits, traces and steps) or the losses (log loss of each space) are missing.
-        After an error the fitted model is lost.
+        (of fits, traces and steps) or the losses (log loss of each space) are missing. After an
+        error the fitted model is lost.
         """
         channels, samples = self.restore_shape(state)
         average, *counts = map(int, state["counts"])

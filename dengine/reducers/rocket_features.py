@@ -295,10 +295,9 @@ class RocketEncoder(nn.Module):
         `scale`, which must be set before. `rng` draws the kernels: MiniRocket's for tower 1, normal
         weights less their mean for tower 2. It writes `kernel`, `threshold` and, if there are
         groups, `competing_kernel`. Thresholds, which only tower 1 has, are quantiles of the
-        outputs, from 5 to 95 %. A kernel of tower 1 is scaled so that the ramp around
-        its threshold, on which its answer rises from 0 to 1, is two standard deviations of its
-        outputs wide; those of tower 2 are scaled so that all outputs of a dilation have the
-        deviation 1.
+        outputs, from 5 to 95 %. A kernel of tower 1 is scaled so that the ramp around its
+        threshold, on which its answer rises from 0 to 1, is two standard deviations of its outputs
+        wide; those of tower 2 are scaled so that all outputs of a dilation have the deviation 1.
         """
         # `x` is scaled already; averaging is linear, so the scale is taken out again.
         values = self.read_taps(self.average_samples((x - self.shift) / self.scale))  # (C, taps, n)

@@ -153,8 +153,8 @@ def names_this_machine(host: str) -> bool:
     a port, in small or capital letters.
 
     It is False for "" and for brackets without an address; what stands behind the colon, and before
-    an `@`, is not checked. It is False as well for a web page of another site whose name was
-    made to resolve to this machine (DNS rebinding): the browser sends that name as `Host`.
+    an `@`, is not checked. It is False as well for a web page of another site whose name was made
+    to resolve to this machine (DNS rebinding): the browser sends that name as `Host`.
     """
     try:
         return is_loopback(urlsplit(f"//{host}").hostname or "")

@@ -58,13 +58,13 @@ async def drive(service: CellService, cell: ReplayCell) -> None:
     """Insert every part of a data set once, ask the service for a decision, and report the
     outcome.
 
-    `cell` plays them, in the order of `cell.order`, from its first part on; parts have the
-    numbers "0001", "0002" and so on. The recorded result is reported for verified parts, and for
-    accepted parts that are bad, which stop the line. The first `N_FAST` parts (150) come without a
-    pause, but a retrain that is under way is waited for; later parts come once a second, and their
-    report after 40 % of this time. An accepted good part and a rejected part get no report. A log
-    line says when all parts were played. An exception, also that of a full queue, is logged and
-    ends the demonstration, not the server; nothing is raised, except if the task is cancelled.
+    `cell` plays them, in the order of `cell.order`, from its first part on; parts have the numbers
+    "0001", "0002" and so on. The recorded result is reported for verified parts, and for accepted
+    parts that are bad, which stop the line. The first `N_FAST` parts (150) come without a pause,
+    but a retrain that is under way is waited for; later parts come once a second, and their report
+    after 40 % of this time. An accepted good part and a rejected part get no report. A log line
+    says when all parts were played. An exception, also that of a full queue, is logged and ends the
+    demonstration, not the server; nothing is raised, except if the task is cancelled.
     """
     loop = asyncio.get_running_loop()
     next_start = loop.time()

@@ -277,10 +277,12 @@ class AddressSpace:
     async def refresh(self) -> None:
         """Read the cell's status and write it into the OPC UA variables.
 
-        An event is sent if the alarm has changed (`write_status`). If the status cannot be read or
-        written, a warning is logged, and the variables keep their values with the OPC UA status
-        code UncertainLastUsableValue, which marks them as old; the variable LastRefused, which is
-        not part of the status, is not touched. Nothing is raised.
+        An event is sent if the text of the alarm has changed (`write_status`). If the status cannot
+        be read or written, or the event cannot be sent, a warning is logged and no error is raised.
+        All variables of the status then get the OPC UA status code UncertainLastUsableValue, which
+        marks them as old. They keep their values; those written before the error keep the new ones.
+        The variable LastRefused is not part of the status, and stays as it is. An error while the
+        variables are marked is raised.
         """
         try:
             await self.write_status(await self._calls.status())

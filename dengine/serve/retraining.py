@@ -3,9 +3,8 @@ of `dengine serve` retrains.
 
 In a process of its own a retrain never holds the lock of the interpreter that answers decisions.
 Calls and results are pickled in the executor's thread into a file in memory (`memfd_create`), and
-their arrays are written and read without that lock. `torch.multiprocessing`
-would pass each tensor through shared memory of its own, which holds the lock for tens of
-milliseconds.
+their arrays are written and read without that lock. `torch.multiprocessing` would pass each tensor
+through shared memory of its own, which holds the lock for tens of milliseconds.
 """
 
 from __future__ import annotations

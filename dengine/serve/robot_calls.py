@@ -145,9 +145,8 @@ class RobotCalls:
         TraceError
             For a part that was not begun, is not among the newest `MAX_PARTS` any more, or was
             decided on by `decide_added` since `begin`; for a piece that `as_samples` refuses, such
-            as one without samples, or that has a list for
-            each channel; and for more than `MAX_SAMPLES` samples of the part. A refused piece is
-            not added.
+            as one without samples, or that has a list for each channel; and for more than
+            `MAX_SAMPLES` samples of the part. A refused piece is not added.
         ReportError
             For an invalid id.
         """

@@ -393,9 +393,9 @@ class CellService:
     async def status(self, watching: bool = False) -> Status:
         """Return the status that `DataEngine.status` returns, but read the store like `read`.
 
-        `watching` is the argument of `DataEngine.status`. Raises BusyError if the
-        queue is full or the service is closing, StoreError if the store cannot be read, and
-        SettingError for a stored recipe that cannot be read.
+        `watching` is the argument of `DataEngine.status`. Raises BusyError if the queue is full or
+        the service is closing, StoreError if the store cannot be read, and SettingError for a
+        stored recipe that cannot be read.
         """
         stored = await self.read(lambda store: status(store, watching=watching))
         return self.engine.state.complete(stored)
@@ -491,8 +491,8 @@ class CellService:
 
         This is the body of the engine's thread. `opened` gets the engine, or the exception that
         `make` raised; the thread ends after such an exception. While the queue is empty, the engine
-        does its other work, like retrains (`_next_job`). After each job that is not `read_only`
-        and each finished retrain, every iteration over the service's `changes` yields True.
+        does its other work, like retrains (`_next_job`). After each job that is not `read_only` and
+        each finished retrain, every iteration over the service's `changes` yields True.
         """
         try:
             engine = make()

@@ -415,8 +415,7 @@ class Database:
     def _check_file(self) -> None:
         """Raise FileNotFoundError if the opened SQLite file is no longer the one at its path.
 
-        It is also raised if the path cannot be looked at, for example for lack of a right.
-
+        It is also raised if the path cannot be looked at, for example for lack of permission.
         PostgreSQL and a store in memory are not checked.
         """
         if self._file is None:
@@ -592,10 +591,9 @@ class Database:
             If the database fails, is closed or was opened before a fork, if the function given to
             the method `commit_if` returns False, and in place of a ValueError, TypeError,
             OverflowError or OSError that `add_rows` raised; dengine's own errors and all others
-            pass unchanged.
-            After an error nothing is written, with two exceptions: if the SQLite file was replaced
-            meanwhile, the old file may have the rows; and if the connection to a server broke
-            during the commit, the server may have them.
+            pass unchanged. After an error nothing is written, with two exceptions: if the SQLite
+            file was replaced meanwhile, the old file may have the rows; and if the connection to a
+            server broke during the commit, the server may have them.
         """
         self.check_open()
         self.before_use()  # before the lock is taken: it may write

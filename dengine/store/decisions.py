@@ -142,8 +142,6 @@ class DecisionTable(CellTable):
     def unreported_accepts(self, since_version: int = 0) -> list[str]:
         """Return the ids of the cell's accepted decisions without a label, oldest first.
 
-        A forgotten label is a label here.
-
         Parameters
         ----------
         since_version : int, default 0

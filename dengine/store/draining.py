@@ -284,11 +284,11 @@ class Drainer:
         """Copy all records that are on the journal's disk by now to the database.
 
         They go in chunks of at most CHUNK (500) records, see `_drain_chunk`. A decision that a
-        later record replaces is left out. Later records go with them only if they
-        still fit into the last chunk. The journal's head, the small file beside it, is synced
-        first. At the end, or at once if there are no records, the last error, which `fault` shows,
-        is cleared. Raise StoreError if the database fails: chunks that were committed stay, and the
-        last error is kept.
+        later record replaces is left out. Later records go with them only if they still fit into
+        the last chunk. The journal's head, the small file beside it, is synced first. At the end,
+        or at once if there are no records, the last error, which `fault` shows, is cleared. Raise
+        StoreError if the database fails: chunks that were committed stay, and the last error is
+        kept.
         """
         synced_to = self._recorder.n_synced
         if self.n_drained < synced_to:

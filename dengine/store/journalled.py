@@ -303,9 +303,9 @@ class JournalledStore(Outbox):
     def load_ids(self) -> None:
         """Read the ids of all decisions from the database, and keep their hashes in memory.
 
-        By these a new id is recognized without the database. It takes about a second for
-        a million ids, without a time limit; other calls to this outbox may go on meanwhile. Once
-        all are loaded, another call does nothing. Raise StoreError if the database cannot be read.
+        By these a new id is recognized without the database. Loading takes about a second for a
+        million ids, without a time limit; other calls to this outbox may go on meanwhile. Once all
+        are loaded, another call does nothing. Raise StoreError if the database cannot be read.
         """
         if self._index.has_all_ids:
             return

@@ -43,8 +43,9 @@ class DecisionIndex:
         """Add a record that was just recorded; an event, which has no id, changes nothing.
 
         `entry` holds the record. It replaces an earlier decision of that id, or an earlier label of
-        that decision. The oldest of more than N_RECENT decisions (1,000) leaves `recent`; one that
-        is replaced counts as old as it was.
+        that decision. A decision enters `recent`, and the oldest leaves it if there are then more
+        than N_RECENT (1,000). A decision that replaces one in `recent` keeps its place in the
+        order, and any other is the newest. `find` finds one that left until it is drained.
         """
         record = entry.record
         if isinstance(record, StoredDecision):

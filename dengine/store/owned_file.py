@@ -23,9 +23,8 @@ def _lock_of_system() -> Callable[[int], object]:
 
     The function does not wait: it raises BlockingIOError if another descriptor has the lock, and
     otherwise the OSError of the system, for example if the file system has no locks. The lock ends
-    when the file is closed or the process ends. It is that of
-    `flock`. On Windows one byte far behind the content is locked, and the function moves the offset
-    of the file there.
+    when the file is closed or the process ends. It is that of `flock`. On Windows one byte far
+    behind the content is locked, and the function moves the offset of the file there.
     """
     try:
         import fcntl

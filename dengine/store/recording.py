@@ -148,9 +148,9 @@ class Recorder:
         """Wait until everything recorded so far is on the disk, at most `seconds`.
 
         None: `limit` seconds, an argument of `Recorder`. If everything is on disk already, this
-        returns at once; else the records are written without the usual delay. Raise
-        NotTakenError if that takes longer, or a write fails meanwhile. The records are not lost
-        then: the thread, unless it was stopped, tries to write them again.
+        returns at once; else the records are written without the usual delay. Raise NotTakenError
+        if that takes longer, or a write fails meanwhile. The records are not lost then: the thread,
+        unless it was stopped, tries to write them again.
         """
         limit = self._limit if seconds is None else seconds
         with self.changed:
@@ -197,10 +197,10 @@ class Recorder:
 
         The thread runs this; `kept` is only kept alive by it. A batch has the oldest records, at
         most CHUNK (500). It begins BATCH_SECONDS (0.05 s) after there is a record, or at once if
-        somebody waits for the disk or the thread is stopped.
-        Before it ends, it writes the records that wait. After an error, which is kept for `fault`
-        and not logged, it wakes those who wait in `sync`, and tries the records again a second
-        later or sooner, unless it was stopped: they then stay unwritten.
+        somebody waits for the disk or the thread is stopped. Before the thread ends, it writes the
+        records that wait. After an error, which is kept for `fault` and not logged, it wakes those
+        who wait in `sync`, and tries the records again a second later or sooner, unless it was
+        stopped: they then stay unwritten.
         """
         while True:
             with self.changed:

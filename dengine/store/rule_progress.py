@@ -65,8 +65,8 @@ def read_rule_progress(
     RuleProgress
         The newest label that the rule includes, and which decisions count as overdue; of these only
         those with a lower bound above 0 or an upper one below 1 (`overdue_outcomes`). `last_seq` is
-        0 if there is no version, or if the rule must be rebuilt
-        from all outcomes (see `RuleProgress`).
+        0 if there is no version, or if the rule must be rebuilt from all outcomes (see
+        `RuleProgress`).
     """
     state = {} if version is None else version.state
     overdue_to = max(

@@ -293,9 +293,9 @@ class CellCheck:
 
         The rows of the tables that the ledger chains come first, then the ledger's entries, the
         settings, events about lost data that nobody has acknowledged, and whether decisions, traces
-        and labels belong together. At the end come the journal, if `loss`, which says what is
-        damaged in it, is not "", and those of `entries`, the ledger entries that the journal names,
-        that the ledger lacks.
+        and labels belong together. At the end comes the journal: `loss` says what is damaged in it,
+        "" if nothing is, and `entries` are the ledger entries that it names. Damage is a fault, and
+        so is each of these entries that the ledger lacks.
 
         Fill `digests`, the digests of the ledger's entries, and `rows`, the number of rows read,
         and call `on_rows` with the number of rows just read. A database error is a fault, too, and
@@ -381,10 +381,9 @@ class CellCheck:
 
         `digests` gets the digest of each entry, hexadecimal, oldest first. An entry must fit the
         digest of the entry before, and the sums of its rows as they are stored: that a row does not
-        fit its sum is a fault of its own. All rows must be checked first (`_check_rows`).
-        After an entry that was changed, only this entry is a
-        fault. Only the first 20 missing entries are yielded; those behind the newest that an entry
-        or a row names cannot be noticed.
+        fit its sum is a fault of its own. All rows must be checked first (`_check_rows`). After an
+        entry that was changed, only this entry is a fault. Only the first 20 missing entries are
+        yielded; those behind the newest that an entry or a row names cannot be noticed.
         """
         sums = {}
         for table, packed in self._sums.items():

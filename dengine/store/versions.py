@@ -110,13 +110,13 @@ class VersionTable(CellTable):
     def insert(self, connection: sa.Connection, row: Row) -> int:
         """Insert the row of a retrain; return the number of its version. Nothing is committed.
 
-        `row["version"]` is the number that the caller wants for the version. The retrain, whose
-        number is another one, gets the next number of the cell or its product; the product is then
-        locked until the transaction ends. If the version is not put in force (`accepted` of the row
-        is False), it has the number wanted, and nothing else is done. Otherwise it gets the number
-        after the product's newest version if another cell of the product has taken the number
-        wanted, and the states of older versions of cell and product that `keeps_state` does not
-        keep are deleted.
+        The retrain and its version are numbered apart. The retrain gets the next number of the cell
+        or its product; the product is then locked until the transaction ends. `row["version"]` is
+        the number that the caller wants for the version. If the version is not put in force
+        (`accepted` of the row is False), it has that number, and nothing else is done. Otherwise it
+        gets the number after the product's newest version if another cell of the product has taken
+        the number wanted, and the states of older versions of cell and product that `keeps_state`
+        does not keep are deleted.
         """
         number: int = row["version"]
         if row["accepted"]:

@@ -200,12 +200,11 @@ class UrCell(AbstractContextManager["UrCell"]):
 
         The order gets the next number; after 200,000,000 comes 1. This call waits at most
         `order_timeout` seconds. Packages that were received before are discarded. If the connection
-        is lost meanwhile, the order is written again at the first package of the next
-        connection, unless the order is 10 s old by then or the controller was restarted: a robot
-        must not move when nobody expects it.
-        The order INSERT also waits, within the same time, for the end of a trace
-        that has begun. It sets `last` to the insertion, or to None if none was complete by then.
-        Raise CellError if the robot does not answer in time, fails, or its program stops.
+        is lost meanwhile, the order is written again at the first package of the next connection,
+        unless the order is 10 s old by then or the controller was restarted: a robot must not move
+        when nobody expects it. The order INSERT also waits, within the same time, for the end of a
+        trace that has begun. It sets `last` to the insertion, or to None if none was complete by
+        then. Raise CellError if the robot does not answer in time, fails, or its program stops.
         """
         newest = self.recorder.arm()  # discards what was received between orders
         self._number = self._number % MAX_NUMBER + 1

@@ -138,11 +138,11 @@ class RtdeClient:
     def _request(self, type_: PackageType, payload: bytes) -> bytes:
         """Send a request, wait for its response, and return the payload of the response.
 
-        The response has the type of the request, `type_`. Packages, here all messages of RTDE, of
-        another type that arrive before it are dropped.
-        But if the request is START, a data package that arrives first counts
-        as the response "accepted" (the byte 1), and is kept for `rows`. Raise CellError if the
-        connection is lost or silent for `timeout` seconds, or for bytes that are no RTDE.
+        The response has the type of the request, `type_`. Packages of another type (RTDE calls
+        every message a package) that arrive before it are dropped. But if the request is START, a
+        data package that arrives first counts as the response "accepted" (the byte 1), and is kept
+        for `rows`. Raise CellError if the connection is lost or silent for `timeout` seconds, or
+        for bytes that are no RTDE.
         """
         self._send(Package(type_, payload).to_bytes())
         while (package := next(self._incoming)).type is not type_:

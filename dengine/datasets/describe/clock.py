@@ -98,10 +98,10 @@ def form_of(column: Column, p: Proposal, is_alone: bool) -> str:
 
     The form of dates or times of day comes first, then the unit that the file states, the one in
     the column's name, like `ms` of `t [ms]`, `t in 0.1 ms` or `millis`, and what the size of the
-    numbers proves. A note on `time.format` in `p` says why it is `?`, or s by the size alone.
-    If several forms of dates fit, so that day and month can be confused, the form is `?`; but if
-    another column tells a part of the time, too, and all recordings have one and the same date, it
-    is the first of these forms.
+    numbers proves. A note on `time.format` in `p` says why it is `?`, or that only the size of the
+    numbers says s. If several forms of dates fit, so that day and month can be confused, the form
+    is `?`; but if another column tells a part of the time, too, and all recordings have one and the
+    same date, it is the first of these forms.
 
     is_alone : whether no other column tells a part of the time.
     """

@@ -168,12 +168,12 @@ def part_words(source: PartSource, tables: Tables) -> Words:
 def sources_of(p: Proposal, paths: Names) -> Iterator[LabelSource]:
     """Yield the sources that may hold the labels.
 
-    They come in this order: pairs of columns of listings among `p.others`, of which one may
-    name the recordings or parts (`key`), since it has more different words than half of its rows,
-    and the other may hold labels;
-    regular expressions for the paths (if a file or a column is a part), of words like "ok" in them
-    and of any words at fixed places; columns without another use that have one word in all rows of
-    a recording; and lines above the header. A file that cannot be read as a listing is skipped.
+    They come in this order: pairs of columns of listings among `p.others`, of which one may name
+    the recordings or parts (`key`), since it has more different words than half of its rows, and
+    the other may hold labels; regular expressions for the paths (if a file or a column is a part),
+    of words like "ok" in them and of any words at fixed places; columns without another use that
+    have one word in all rows of a recording; and lines above the header. A file that cannot be read
+    as a listing is skipped.
 
     paths : the path of each recording.
     """
@@ -232,6 +232,8 @@ def count_sources(p: Proposal, stated: Sequence[LabelSource]) -> dict[LabelSourc
     only those whose tables were read. The words are sorted into good, bad and unchecked as
     `with_meanings` does. Raises DataError if the stated source has no words or cannot be read, and
     SettingError for a malformed `windows.trigger`.
+
+    stated : the source that the user stated, `[label]`; empty if there is none.
     """
     looked_at = {table.source for table in p.tables}
     others = [Table(name, {}, [], path=name) for name in p.names if name not in looked_at]
@@ -253,9 +255,10 @@ def meanings_of(source: LabelSource, words: Words) -> Meanings:
     The source has the lists of these words, and `words` the word of each recording. The dict is
     empty if a word is in no list, or if none is for good or bad.
     """
-    if not {*words.values()} <= source.meanings.keys():
+    known = source.meanings
+    if not {*words.values()} <= known.keys():
         return {}
-    meanings = {name: source.meanings[word] for name, word in words.items()}
+    meanings = {name: known[word] for name, word in words.items()}
     return meanings if {*meanings.values()} - {None} else {}
 
 
@@ -291,7 +294,7 @@ def propose_label(p: Proposal) -> None:
         titles = map(title_of, counted, counted.values())
         p.put("label.column", UNKNOWN, "; ".join([*titles, doubt]))
         return
-    label = [*certain, *named][0]
+    label = (certain or named)[0]
     words = counted[label]
     checks = tuple(source for source in certain[1:] if counted[source].keys() >= words.keys())
     p.description = replace(p.description, label=label, check=p.description.check or checks)

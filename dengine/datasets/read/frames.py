@@ -92,10 +92,10 @@ def _turned(value: Any) -> Mapping[Any, Any] | None:
     """Return a list of mappings as a list for each key, or a list of lists as one for each channel.
 
     The shorter axis of a list of lists is the channels (of equal ones the first), which are
-    numbered from 0. A NumPy array counts as a list. A mapping is returned as it is,
-    and None for any other value, also an empty list.
-    Keys that the first mapping of a list lacks are left out. Raises LookupError, TypeError or
-    ValueError if an item lacks a key of the first, is of another kind or has another length.
+    numbered from 0. A NumPy array counts as a list. A mapping is returned as it is, and None for
+    any other value, also an empty list. Keys that the first mapping of a list lacks are left out.
+    Raises LookupError, TypeError or ValueError if an item lacks a key of the first, is of another
+    kind or has another length.
     """
     if isinstance(value, Mapping):
         return value
@@ -169,10 +169,10 @@ def read_ts(content: bytes, source: str, form: TextForm) -> Table:
 
     Channels are the columns `0`, `1`, ..., whose cells are lists of texts; the class is the column
     `class`, always the text behind the last colon of the line. A series with fewer channels than
-    others has None for each that is missing. `content`
-    has the bytes of the file, `source` is its name in errors, and of `form` the encoding is used.
-    Raises UnreadableError if the file is not in this encoding, or has no series below a line
-    `@data`, and LookupError for an encoding that Python does not know.
+    others has None for each that is missing. `content` has the bytes of the file, `source` is its
+    name in errors, and of `form` the encoding is used. Raises UnreadableError if the file is not in
+    this encoding, or has no series below a line `@data`, and LookupError for an encoding that
+    Python does not know.
 
     References
     ----------

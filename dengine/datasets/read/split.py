@@ -117,12 +117,13 @@ def split(table: Table, description: Description) -> Iterator[Table]:
 
 
 def _split_rows(table: Table, description: Description) -> Iterator[Table]:
-    """Yield the table of each part, whose rows have the same words in `part.column`.
+    """Yield a table for each part: the rows that have equal words in the columns `part.column`.
 
-    The parts come in the order of their first rows. A row with a wrong number of cells is in no
-    part; a part has damage if such a row stands within or beside it, or if rows of other parts
-    stand between its own and `time.sort` is not set. Raises DataError if `part.column` is not
-    stated or not in the table.
+    The parts come in the order of their first rows, and the words stand in each table's `source`. A
+    row with a wrong number of cells is in no part. A part has damage if such a row stands between
+    its first and its last row, or directly before or behind these. It also has damage if rows of
+    other parts stand between its own and `time.sort` is not set. Raises DataError if `part.column`
+    is not stated, or a column of it is not in the table or has lists as cells.
     """
     import pandas as pd
 

@@ -25,18 +25,17 @@ def cut(table: Table, description: Description, base: Path) -> Iterator[Table]:
     """Yield the table of each part of a long recording, as `[windows]` says.
 
     A part is a window of rows, which a trigger begins, or whose start and end are in a listing, a
-    file in the folder `base`; with both stated the trigger counts. A trigger's
-    window has `traces.samples` rows, or fewer at the end of the recording, which is no damage.
-    Those of a listing come by increasing start, and one without samples has one row.
-    The `path` of its table is the
-    number of the part from 1, or its key in the listing. It has `damage` if a trigger begins it in
-    a gap of the times, or if a window of the listing has no samples, overlaps an earlier one, or
-    goes beyond the recording. If the labels are a topic of a bag, that column has at most one cell:
-    the first label between the start of the part and the start of the next. Raises DataError if
-    `time.column` is not stated, if a trigger cuts and the rate is not stated, if no part is found,
-    if the recording has damage, or if times, signals, labels or the listing cannot be read, and
-    SettingError for a malformed trigger. LookupError for a listing in an encoding that Python does
-    not know.
+    file in the folder `base`; with both stated the trigger counts. A trigger's window has
+    `traces.samples` rows, or fewer at the end of the recording, which is no damage. Windows of a
+    listing come by increasing start, and one without samples has one row. The `path` of a part's
+    table is the number of the part from 1, or its key in the listing. A part has `damage` if a
+    trigger begins it in a gap of the times, or if a window of the listing has no samples, overlaps
+    an earlier one, or goes beyond the recording. If the labels are a topic of a bag, that column
+    has at most one cell: the first label between the start of the part and the start of the next.
+    Raises DataError if `time.column` is not stated, if a trigger cuts and the rate is not stated,
+    if no part is found, if the recording has damage, or if times, signals, labels or the listing
+    cannot be read, SettingError for a malformed trigger, and LookupError for a listing in an
+    encoding that Python does not know.
     """
     name = table.source
     if not description.time.column:

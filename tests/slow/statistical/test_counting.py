@@ -154,11 +154,11 @@ def one_gate_for_all_heads(patch: pytest.MonkeyPatch) -> None:
     fit_heads = rocket.fit_heads
 
     def gated(g: Tensor, y: Tensor, outside: Tensor, *rest: Any) -> Any:
-        w, loss, unsure, steps = fit_heads(g, y, outside, *rest)
-        if unsure:
-            w = torch.zeros_like(w)
-            w[:, -1] = torch.logit((outside.double() @ y.double()) / outside.sum(1))
-        return w, loss, unsure, steps
+        fit = fit_heads(g, y, outside, *rest)
+        if (fit.w[:, :-1] == 0).all(1).any():  # a head was replaced by its base rate
+            fit.w.zero_()
+            fit.w[:, -1] = torch.logit((outside.double() @ y.double()) / outside.sum(1))
+        return fit
 
     patch.setattr(rocket, "fit_heads", gated)
 
@@ -171,9 +171,9 @@ def features_screened_by_labels(patch: pytest.MonkeyPatch) -> None:
             g.std(0) + 1e-9
         )
         best = torch.zeros(g.size(1)).index_fill_(0, relevance.topk(10).indices, 1.0)
-        w, *others = fit_heads(g * best, y, *rest)
-        w[:, :-1] *= best
-        return (w, *others)
+        fit = fit_heads(g * best, y, *rest)
+        fit.w[:, :-1] *= best
+        return fit
 
     patch.setattr(rocket, "fit_heads", screened)
 
@@ -181,12 +181,12 @@ def features_screened_by_labels(patch: pytest.MonkeyPatch) -> None:
 def evidence_after_its_label(patch: pytest.MonkeyPatch) -> None:
     whole = LiveModel.learn
 
-    def learn(self: Any, item: Any, success: bool, silent: int) -> Any:
+    def learn(self: Any, item: Any, success: bool, number: int, silent: int | None) -> Any:
         if (model := self.answering) is not None:
-            model.add_reference(item.trace, int(success), item.content_hash)
+            model.add_reference(item.trace, int(success), item.content_hash, number)
             now = model.predict_one(item.trace)
             item = replace(item, decision=replace(item.decision, lower=now.lower, upper=now.upper))
-        return whole(self, item, success, silent)
+        return whole(self, item, success, number, silent)
 
     patch.setattr(LiveModel, "learn", learn)
 
