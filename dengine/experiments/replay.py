@@ -73,7 +73,7 @@ COUNTED = (
     "outside",
 )
 # Settings of a policy that are columns of tables.
-POLICY_COLUMNS = ("interval", "alpha", "lower_bound", "guarantee", "stops")
+POLICY_COLUMNS: tuple[str, ...] = ("interval", "alpha", "lower_bound", "guarantee", "stops")
 
 
 @dataclass(frozen=True)
