@@ -20,7 +20,9 @@ MASK = "***"
 # Up to the last @, for a password may hold an unescaped one, or a blank. A path writes // as /.
 URL = re.compile(r"(\w[\w+.-]*:/{1,2}[^\s:/@'\"]*):(\S*|[^\n'\"]*)@")
 # In the query of a URL, or as libpq writes it.
-PASSWORD = re.compile(r"\b(password|passwd|sslpassword)=[^&\s'\"]+", re.IGNORECASE)
+PASSWORD = re.compile(
+    r"\b(password|passwd|sslpassword)=('(\\.|[^'\\])*'|\"[^\"]*\"|[^&\s'\"]+)", re.IGNORECASE
+)
 QUOTES = ("'", '"')
 OPTIONS = "channels?|fit|samples|rate_hz|unit|trigger"
 OPTION = re.compile(
@@ -36,8 +38,8 @@ def without_password(text: str) -> str:
     """Return a text in which *** stands for every password of a database URL.
 
     Two forms are masked, `scheme://user:***@host` and `password=***`, also with the names passwd
-    and sslpassword. In the second form the password ends before a blank, a quote or "&", so one in
-    quotes is not masked. The rest of the text stays.
+    and sslpassword. In the second form the password is in quotes, or ends before a blank, a quote
+    or "&". The rest of the text stays.
     """
     return PASSWORD.sub(rf"\1={MASK}", URL.sub(rf"\1:{MASK}@", text))
 

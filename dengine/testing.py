@@ -292,8 +292,8 @@ def _train_clone(reducer: Any, times: int = 1, labels: Ints | None = None) -> Re
     """Return a clone of a reducer, trained `times` times in a row on the 100 `toy_traces()`.
 
     It is trained like in an engine: the fold of a trace follows from its content. There are as many
-    folds as embedding spaces. A transformer with labels that has no spaces of its own is
-    cross-fitted in 2 folds. Each training takes at most 8 optimiser steps. `reducer` stays
+    folds as embedding spaces. A transformer that uses labels and has but one space is cross-fitted
+    in 2 folds, so it has two. Each training takes at most 8 optimiser steps. `reducer` stays
     unchanged. `labels`, shape (100,), replace those of the traces; None keeps them.
     """
     X, y = toy_traces()

@@ -66,9 +66,13 @@ def export(
     the C and C++ sources that run such a file.
 
     STORE is the engine's store, as given to `dengine train` or `dengine run`; the cell may run
-    meanwhile, and an event records the export. Before the first retrain there is nothing to export,
-    and the exit code is 1. STORE needs --out, and --out needs STORE; --make-key and --cpp need
-    neither. If --make-key is given together with STORE and --out, the new key also signs FILE; so
+    meanwhile, and an event records the export. But the exported file never learns the outcome of a
+    part that was accepted and is still open. Before the first retrain there is nothing to export,
+    and the exit code is 1; so it is for onnx if the engine audits, has force limits, or another
+    guarantee than local with stops some. STORE needs --out, and --out needs STORE; --make-key and
+    --cpp need neither.
+
+    If --make-key is given together with STORE and --out, the new key also signs FILE; so
     --key and --make-key exclude each other. Whoever has the key can check an exported file, and can
     also sign one. The output names the files, the version and its number of references. The key
     comes first, then the sources, then FILE; if one of them fails, what was written before stays.

@@ -297,7 +297,7 @@ class RecipeChoice:
     def make_contender(self) -> Contender:
         """Return who plays a replay: a `Contender`, which is a recipe or a baseline with its name.
 
-        It is what `Contender.load` returns for the name, or for conv without one, with the settings
+        It is what `Contender.load` returns for the name (conv if none was given), with the settings
         that were given. Its name is shortened, as `short_name` does.
 
         Raises
@@ -463,8 +463,8 @@ class DataChoice:
         Raises
         ------
         DataError
-            If the source does not exist or is damaged, or its description cannot be read or
-            proposed.
+            If the source does not exist or is damaged, its description cannot be read or proposed,
+            or a stated key is unknown or its value has the wrong type.
         SettingError
             If none was saved, and a stated `windows.trigger` is malformed.
         """
@@ -654,9 +654,10 @@ def recorder_settings(options: Options) -> tuple[dict[str, Any], TraceSpec]:
 
     They come from the values of `--samples`, `--channels`, `--rate-hz`, `--unit` and `--fit` in
     `options`, by name, as far as they were given; other options are ignored. The settings are
-    samples, rate_hz and channels, and those that were not given are left out. The `TraceSpec` also
-    has the unit and the fit (what is done with traces of another length). Raises SettingError for
-    values that no trace can have.
+    samples, rate_hz and channels, and those that were not given are left out. The `TraceSpec` has
+    the recorder's defaults for them (see `spec_of_recording`), and also the unit and the fit (what
+    is done with traces of another length). Without `--unit` the unit of a force is N, and any other
+    is unknown. Raises SettingError for values that no trace can have.
     """
     from ..cells.ur.recorder import spec_of_recording
 

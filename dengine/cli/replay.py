@@ -295,11 +295,13 @@ def _replay_and_print(
     check_seconds: float,
     out: Out | None,
 ) -> None:
-    """Play a grid of replays, print tables or one JSON document, and write the files of `out`.
+    """Play replays with all combinations of the values in `grid`, print tables or one JSON
+    document, and write the files of `out`.
 
     After Ctrl-C or an error the finished replays are shown, if there are some, and a line on stderr
     says how many. Then the process ends with exit code 130, or the error is raised. Errors of the
-    data set or the policies are raised before anything is played.
+    data set, and settings out of range, are raised before anything is played. A file that cannot be
+    written is an OutputError, raised after the result was printed.
 
     Parameters
     ----------
@@ -403,8 +405,10 @@ def _replay_files(
 
 
 def _row_name(replay: Replay, frame: pd.DataFrame) -> str:
-    """Return a label for a replay in figures: the name of its recipe or baseline, and those of its
-    settings that vary in `frame`, the table of all replays, with commas between.
+    """Return a label for a replay in figures, like "conv, alpha 0.1, LB 90 %".
+
+    It has the name of the recipe or baseline, and of guarantee, stops, interval, alpha and LB those
+    that vary in `frame`, the table of all replays.
     """
     policy = replay.recipe.policy
     settings = {
@@ -498,7 +502,8 @@ def costs(
     (--alpha) where a list is tried (--alphas) is a usage error. All costs are in one unit, such as
     seconds of production or money. --out writes costs.csv and costs.png. Ctrl-C, or an error in a
     replay, ends it and shows what was finished, if at least two shuffles are finished by every
-    policy that is left.
+    policy that is left. The exit code is 1 if a check costs as much as a bad accepted part or more,
+    if a false reject costs nothing, or if the recordings have one label only or are too few.
     """
     _refuse_value_beside_list(choice.settings, ("alphas", "lower_bounds"))
     from ..experiments.costs import find_policy, settings_of
@@ -608,8 +613,8 @@ def _cost_cells(row: PolicyCost, is_chosen: bool) -> tuple[str, ...]:
 
     The first is ">" if the policy is chosen, else "". The others are its rule (like "alpha 0.1"
     under the guarantee local, else the name of the guarantee), LB ("-" under cost), cost with its
-    interval in a second line, late cost, share of verified parts, and wrong accepts and rejects
-    with the intervals of their shares.
+    interval in a second line, late cost (over the last third of each shuffle), share of verified
+    parts, and wrong accepts and rejects with the intervals of their shares.
     """
     policy = row.policy
     is_local = policy.guarantee == "local"

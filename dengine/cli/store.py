@@ -79,7 +79,8 @@ def _change_and_print(
     instead, which also has the policy and the certificate after the change. `allow_import` permits
     to import the reducer or rule, module:Class, that the store names. The engine waits up to 10 s
     for the disk or database. Raises the errors of `DataEngine.open` (StoreError if an engine runs
-    on the cell), those of `certificate`, and whatever `change` raises; nothing is printed then.
+    on the cell), those of `certificate`, and whatever `change` raises; nothing is printed then. An
+    error of `certificate` comes after the change, which stays.
     """
     from ..engine.engine import DataEngine
     from ..store.opening import LONG_WAIT
@@ -108,10 +109,12 @@ def report(part: str, label: str, **changing: Any) -> None:
     one decision, or one that is no reject; otherwise it is refused, and so is a part that is not in
     the store. For an accepted part, bad is a line stop, and good a confirmation. For a rejected
     part the label is that of an inspection: the engine trains on it, and the rule does not learn
-    it. An event records the report. The same label again changes nothing. Another label than the
-    reported one is refused with exit code 1, unless it is a line stop; `dengine correct` puts a
-    wrong label right. The subcommand is refused while an engine runs on the cell. A store that
-    names a reducer or rule of your own, module:Class, needs --allow-import.
+    it. An event records the report. A retrain that is due then runs. The same label again changes
+    nothing. Another label than the reported one is refused with exit code 1, unless it is a line
+    stop after a confirmation, and so is any report on a forgotten label; `dengine correct` puts
+    either right. Only the newest 20 decisions on the part are looked at. The subcommand is
+    refused while an engine runs on the cell. A store that names a reducer or rule of your own,
+    module:Class, needs --allow-import.
     """
     from ..engine.corrections import Changed
     from ..history.explain import find_decision_id
@@ -383,8 +386,10 @@ def backup(store: str, out: Path) -> None:
 
     The copy is one file with all cells and with the contents of the journals that lie beside the
     store, which a plain copy of the file lacks. It can be opened, and checked by `dengine verify`,
-    wherever it is. A store in PostgreSQL is refused (pg_dump copies it), and so are an --out that
-    exists and a journal that cannot be read.
+    wherever it is. Damaged records of a journal are left out, and a record that contradicts the
+    store becomes an event of kind "dead letter" in the copy. Cells without a journal are named. A
+    store in PostgreSQL is refused (pg_dump copies it), and so are an --out that exists and a
+    journal that cannot be read.
     """
     from ..store.backup import backup_store
 

@@ -205,10 +205,9 @@ class Dataset:
         """Return a data set with only the first `samples` samples of each trace.
 
         If `fit` is "pad" and the traces become shorter, it becomes "cut" in the result; all other
-        fields stay, `lengths` too. Its X may share its memory with that of this data set if nothing
-        is cut off; otherwise it is a copy. Raises DataError if `samples` is below 1, if the traces
-        are shorter, or if `fit` is "resample" and they would become shorter: their first samples
-        are not those of the recordings.
+        fields stay, `lengths` too. Its X may share its memory with that of this data set. Raises
+        DataError if `samples` is below 1, if the traces are shorter, or if `fit` is "resample" and
+        they would become shorter: their first samples are not those of the recordings.
         """
         most = self.X.shape[-1]
         least = most if self.fit == "resample" else 1

@@ -87,6 +87,11 @@ class RowWords:
     drop: Words = ()
     invalid: Words = ()
 
+    def kind(self, word: str) -> str:
+        """Return "keep", "drop" or "invalid" for a word; "" if its meaning is not stated."""
+        kinds = (f.name for w in (word, ANY) for f in fields(self) if w in getattr(self, f.name))
+        return next(kinds, "")
+
 
 @dataclass(frozen=True, slots=True)
 class Clock:
@@ -312,8 +317,9 @@ class Description:
 
         Keys that are left out get their default values. Any key but `version` may have the value
         `?`, but a section may not. A channel named `?` is left out, and so is this name in `[rows]`
-        and `[ignored]`. Of a channel, a text in place of a dict is its unit. `notes` are no key;
-        the result has none. Raises DataError for an unknown key (the message names the most similar
+        and `[ignored]`. Of a channel, a text in place of a dict is its unit. A single value may
+        stand for a list of one, and a number or boolean for a text. `notes` are no key; the result
+        has none. Raises DataError for an unknown key (the message names the most similar
         key, or else all), for a value of the wrong type, and for a description of a newer version
         or one that is no integer.
 

@@ -78,7 +78,7 @@ def check_agreement(data: Dataset, trace_spec: TraceSpec) -> None:
     channel names, these must be the same in the same order. Traces that were read by a description
     (`data.lengths` is set) must have the store's number of samples, and the store and the data set
     must both have the `fit` "resample", or neither. The number of channels, the units and the limit
-    are not compared.
+    are not compared. Raises SettingError where `data.spec` does.
     """
     spec = data.spec
     is_resampled = {item.fit == "resample" for item in (spec, trace_spec)}

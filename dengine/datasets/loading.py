@@ -211,7 +211,8 @@ def _is_own_archive(path: Path) -> bool:
     """Return whether a file is an .npz archive with an array X, and numbers y that are all 1 or 0.
 
     A file of another suffix is not opened. Raises DataError for an .npz file that is damaged or
-    cannot be opened, or whose y holds Python objects or is too large; of its arrays only y is read.
+    cannot be opened, or whose y holds Python objects or needs too much memory (`read_archive`); of
+    its arrays only y is read.
     """
     if path.suffix.lower() != ".npz":
         return False
@@ -223,8 +224,8 @@ def _is_own_archive(path: Path) -> bool:
 def _is_own_table(path: Path) -> bool:
     """Return whether a file is a Parquet file of a table that `Dataset.to_frame` made.
 
-    A file of another suffix is not opened. Raises DataError if a .parquet file is damaged or
-    pyarrow is not installed.
+    A file of another suffix is not opened. Raises DataError if a .parquet file is damaged or cannot
+    be opened, or if pyarrow is not installed.
     """
     if path.suffix.lower() != ".parquet":
         return False

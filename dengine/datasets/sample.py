@@ -27,7 +27,8 @@ def write_sample(folder: FilePath, n: int = 200) -> None:
     folder : path
         A new or an empty folder.
     n : int, default 200
-        Number of files. The set has 1503 insertions; a greater n writes 1503 files.
+        Number of files, 0 or more, which is not checked. The set has 1503 insertions; a greater n
+        writes 1503 files.
 
     Raises
     ------

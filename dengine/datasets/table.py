@@ -154,10 +154,12 @@ class Table:
     def one_word(self, name: str, at: str = "same") -> str:
         """Return the one word, like a label or part number, that a column has for a recording.
 
-        The table holds the rows of the recording. Raises UnreadableError if there is no such column
-        or no row, or if the words of the rows differ and `at` is "same".
+        The table holds the rows of the recording. The word is "" for an empty cell. Raises
+        UnreadableError if there is no such column or no row, if the cells are lists, or if the
+        words of the rows differ and `at` is "same".
 
-        at : "same" if all rows must have this word, "first" or "last" for the row that has it.
+        at : "same" if all rows must have this word, "first" or "last" for the row whose
+        word is returned, also if it is empty.
         """
         words = self.words(name)
         if not len(words):

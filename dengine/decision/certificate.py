@@ -503,9 +503,9 @@ def _bound_audits(
     It is about `n_unchecked` parts that were decided without a check and `n_audited` audited ones,
     together; `alpha` is its error level. `n_bad` of the audited parts, and `n_others` of the
     unchecked ones, are known to be decided wrongly: the bound is never below the share of both.
-    `audit_rate` is the probability with which a certain decision is audited. In the result
-    `shadowed` is True if `audit_rate` is 1 and no part went unchecked. Raises the errors of
-    `failure_bound`.
+    `audit_rate` is the probability with which a certain decision is audited. In the result `n_bad`
+    counts audited parts alone, and `shadowed` is True if `audit_rate` is 1 and no part went
+    unchecked. Raises the errors of `failure_bound`.
     """
     n = n_unchecked + n_audited
     bound = _bound_outcomes(n, n_audited, n_bad, n_unchecked, audit_rate, alpha)

@@ -297,7 +297,8 @@ def _beta_interval(
 
     For the lower end, `prior` is added to the successes and `other_prior` to the failures; for the
     upper end it is the other way round. `alpha` is the error level. The lower end is 0 without a
-    success, the upper end 1 without a failure. The ends are arrays of the counts' shape, or floats
+    success, the upper end 1 without a failure. An end that would leave out the observed rate, as
+    for an alpha near 1, is moved to it. The ends are arrays of the counts' shape, or floats
     for scalar counts. Raises SettingError for an alpha out of range, ValueError for negative counts
     and for counts of two shapes.
     """

@@ -125,7 +125,8 @@ class NoveltyGate(nn.Module):
         squared distance to the nearest reference in these features, divided by the limit of the
         group; references are traces that the gate was fitted to. A reference in a small cluster of
         unusual traces counts as nearer than it is, so a score near it may be below 0. A score is
-        NaN or infinite if a feature overflows.
+        NaN or infinite if a feature overflows; the trace is novel then, too. The scores of a
+        disabled gate mean nothing.
         """
         plain = self.plain_features(x)
         features = torch.cat([plain, plain @ self.discriminants])

@@ -294,8 +294,9 @@ class RadiusIndex(nn.Module):
         """Count the points `inside`, (n,) bool; several points of one part may count as fewer.
 
         m of them that are of one part are worth m / (1 + (m - 1) agreement) votes: one vote if the
-        labels of a part always agree, m votes if they are independent. Returns (successes,
-        failures), each rounded to a whole number, because bounds need whole trials.
+        labels of a part always agree, m votes if they are independent. A point of an unknown part
+        is one vote. Returns (successes, failures), each rounded to a whole number, because bounds
+        need whole trials.
         """
         slots = inside.nonzero().flatten()
         parts = self.parts.index_select(0, slots)

@@ -19,6 +19,7 @@ from ..errors import ReportError, expect, listed
 from ..records import as_success, is_whole
 from ..store.outbox import Outbox
 from ..store.records import (
+    LABEL_TEXTS,
     POLICY_CHANGED,
     Change,
     StoredDecision,
@@ -33,7 +34,6 @@ from .settings import BASELINE_SETTINGS, EvidenceWindow, SettingsInForce, refuse
 
 # Settings of a policy that make its rule, or that its evidence is measured by.
 SCORING = ("alpha", "lower_bound", "interval", "guarantee", "stops", "prices")
-LABEL_TEXTS = {True: "success", False: "failure"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -249,9 +249,14 @@ class Corrections:
         saw a forgotten label.
 
         A training under way in the executor is discarded, even if nothing changes, and no other one
-        begins. A reducer like umap-learn, of which not the fit but only the numbers of its traces
-        are stored, is fitted again on the traces of the earlier version, with the labels that they
-        had then. A baseline is fitted on the same traces, with the labels as they count now.
+        begins, unless this raises; a training that is done is put in force or dropped first. See
+        the class for what else every change does first, and for the check against the ledger. If a
+        safe mode began or ended meanwhile, an event is recorded, and `on_safe_mode`, the user's
+        function, is called. Without an executor the call also waits until the features for the next
+        training are computed, if that starts from another model. A reducer like umap-learn, of
+        which not the fit but only the numbers of its traces are stored, is fitted again on the
+        traces of the earlier version, with the labels that they had then. A baseline is fitted on
+        the same traces, with the labels as they count now.
 
         Parameters
         ----------

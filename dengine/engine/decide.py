@@ -362,8 +362,8 @@ def as_part(part: Any) -> str | None:
     Raises
     ------
     TraceError
-        For anything but None, a whole number of at most LONGEST digits (200), or a text of 1 to
-        LONGEST printable characters. True and False are no numbers.
+        For anything but None, a whole number of at most LONGEST characters (200, with its sign), or
+        a text of 1 to LONGEST printable characters. True and False are no numbers.
     """
     if part is None:
         return None

@@ -218,6 +218,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
 
         `template` is the untrained model, and the arguments from `executor` to `on_safe_mode` are
         those of `DataEngine`. From now on the store is closed when the engine is garbage-collected.
+        The outbox claims the cell, writes what an earlier process left in the journal to the store,
+        and checks the store (`open_outbox`); version and labels are not restored yet (`_resume`).
         Without an executor, and unless the engine only reads (`reading`), the modules that a
         retrain imports are loaded; what that raises, for a reducer of the user's, is raised. Limits
         this thread to one torch thread. Raises SettingError for force limits in seconds at an
@@ -291,7 +293,11 @@ class DataEngine(AbstractContextManager["DataEngine"]):
 
     @contextmanager
     def _closed_on_failure(self) -> Iterator[None]:
-        """Close the store and raise the error again if the block raises; else leave it open."""
+        """Close the outbox and raise the error again if the block raises; else leave it open.
+
+        This also closes the store, unless it is in memory. If closing raises StoreError, that is
+        raised instead.
+        """
         try:
             yield
         except BaseException:
@@ -410,10 +416,11 @@ class DataEngine(AbstractContextManager["DataEngine"]):
             As `DataEngine` takes them. For a used store, the given settings must be the settings in
             force, so that a running cell does not change unnoticed. The shadow mode, a reducer that
             is an object, and what is left out are not compared (for details see
-            `EngineSettings.check_request`). `model` is as for `open`; `executor`, `clock`,
-            `replaying` and `on_safe_mode` are not stored, so any may be given. A new cell of a
-            product (cells that share labels and versions) takes the seed, and the recipe if it is
-            given neither recipe, reducer nor model, from the first of its peers, the other cells.
+            `EngineSettings.check_request`). `model` and `trace` are as for `open`; `executor`,
+            `clock`, `replaying` and `on_safe_mode` are not stored, so any may be given. A new cell
+            of a product (cells that share labels and versions) takes the seed, and the recipe if it
+            is given neither recipe, reducer nor model, from the first of its peers, the other
+            cells.
 
         Returns
         -------
@@ -428,7 +435,10 @@ class DataEngine(AbstractContextManager["DataEngine"]):
             cannot be read. A store that was opened here is then closed; an `SqlStore` that was
             passed may be, too.
         StoreError
-            If another engine owns the cell, or the store cannot be used.
+            If another engine owns the cell, the store cannot be used, or this dengine cannot
+            restore its newest version (in rare cases KeyError, ValueError or NotImplementedError).
+        Exception
+            What an object of yours raises that is loaded, or trained again.
         ImportRefusedError
             If a class would have to be imported that is not allowed.
         """
@@ -558,7 +568,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         nobody reported are confirmed (with `stops="all"`) or counted, which may change the rule.
         The decision is made and recorded. With an id it must be on disk before the caller acts on
         it; if the disk does not take it, the decision becomes VERIFY. Without an id one is made.
-        Raises what `DecisionMaker.convert` raises, before anything else is done.
+        Checks that are overdue are counted. Raises what `DecisionMaker.convert` raises, before
+        anything else is done, and what `Learner.catch_up` raises, before the decision.
         """
         x = self._maker.convert(trace)
         self._learner.catch_up()
@@ -578,10 +589,10 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         recorded, and `on_safe_mode` is called), and a retrain that is due runs in this thread or
         begins in the executor. In a product, newer versions and corrections of the other cells may
         be put in force, too. The label of a trace with a fault is stored; then no retrain follows,
-        and the other cells' news is left for later. If the next decision had confirmed the part as
-        good already, the call also waits for the store, so that the rule is corrected now; if the
-        store does not answer, this happens later. For such a correction a training under way is
-        discarded and begins again, and a baseline is retrained.
+        and the other cells' news is left for later. If a report or the next decision had confirmed
+        the part as good already, the call also waits for the store, so that the rule is corrected
+        now; if the store does not answer, this happens later. For such a correction a training
+        under way is discarded and begins again, and a baseline is retrained.
 
         Parameters
         ----------
@@ -606,6 +617,9 @@ class DataEngine(AbstractContextManager["DataEngine"]):
             same, and the same report may come again. If the id cannot be looked up: nothing is
             learned. Also for an engine that is closed, was opened for reading or before a fork, or
             is in use by another thread.
+        Exception
+            What a handed-in model raises that must be trained or fitted again; the label is on disk
+            then.
         """
         label = as_success(success)  # refused before anything is written
         id_ = as_id(decision_id)

@@ -164,9 +164,9 @@ class Feedback:
         The attribute `remedy` is set if the rule must be rebuilt, which is not done here. An
         exception of rule or model is logged, not raised.
 
-        A label that is learned counts as new and enters the training window; in a product it does
-        so later, from the store. The label of a trace with a fault is only recorded. The part waits
-        for an outcome or a check no longer.
+        A label that is learned counts as new and enters the training window; in a product it enters
+        the window later, from the store. The label of a trace with a fault is only recorded. The
+        part waits for an outcome or a check no longer.
         """
         id_ = stored.decision.id
         if self._unsynced.get(id_) is not success:
@@ -192,7 +192,7 @@ class Feedback:
         decision = stored.decision
         source = source_of(decision, success)
         if stored.source is not None:
-            earlier = (bool(stored.success), stored.source)
+            earlier = (stored.success, stored.source)
             reported = (success, source)
             if (earlier, reported) != LATE_STOP:
                 raise already_reported(decision.id, earlier, reported)

@@ -107,11 +107,12 @@ class Peers:
 
         It gets the present decision rule of this cell: nothing is rebuilt, and the other cell's
         rule is ignored. A failure to take over the rule is logged, and the version is in force all
-        the same. If the version is damaged or cannot be restored, that is logged, the present
-        version stays in force, and `look` does not return this number again. A model like
+        the same. If the version is damaged or not kept, or if the model raises an error that is no
+        StoreError, that is logged, the present version stays in force, and `look` does not return
+        this number again. A model like
         umap-learn is fitted again, and the labels that it is fitted on are checked against the
         ledger. Returns whether the version is in force now. Raises StoreError if the store cannot
-        be read.
+        be read, and for a state that this dengine cannot restore.
         """
         store = self._outbox.store
         try:

@@ -169,6 +169,8 @@ class Learner:
         except StoreError:
             self.feedback.retry_remedy(remedy)
             log.exception("the rule is rebuilt when the store is back")
+        except Exception:  # of a user's model that is fitted again
+            log.exception("the model in force does not learn a corrected label")
 
     def store_labels(self) -> None:
         """Wait until every label is in the store and has its number; then do what `catch_up` does.
@@ -365,6 +367,7 @@ class Learner:
     def _choose_start(self) -> EngineModel:
         """Return the model that the next training starts from: one that saw no forgotten label.
 
+        (A model that begins anew with each training may have seen one; see `find_clean_start`.)
         Without any correction it is the model in force, or the untrained model before the first
         retrain. Otherwise `find_clean_start` chooses it from the store, and the choice is kept
         until another version is in force or another correction comes. If that raises, whatever it
@@ -432,7 +435,8 @@ class Learner:
         It is tested first, so that a model that fails the test is never written to the store. It is
         stored with every label that came until then, and before it is in force: else a killed
         process would leave decisions of a version that nobody has. More labels may come while it is
-        stored, so it learns these before it is put in force.
+        stored, so it learns these before it is put in force. If the training or the test failed,
+        only the report is stored, and the previous version stays in force.
 
         Yields after each step: None, or, if the store has not done its part yet, a function that
         waits for it. Raises StoreError if the version cannot be stored. The functions that it
@@ -453,10 +457,11 @@ class Learner:
         """Make all labels that came references of the candidate, one a step, and have them stored.
 
         The candidate is a trained version that is not in force yet. Each round first counts overdue
-        checks. It yields None after each label, and a function that waits for the store if labels
-        are not stored yet; it ends when no label is missing or waits to be stored. In a cell that
-        never pauses some label always waits, so in every 20th round this call waits for the store
-        itself; a StoreError there is ignored.
+        checks and, in a product, takes over the labels' numbers (`number_labels`). It yields
+        None after each label, and a function that waits for the store if labels are not stored yet;
+        it ends when no label is missing or waits to be stored. In a cell that never pauses some
+        label always waits, so in every 20th round this call waits for the store itself; a
+        StoreError there is ignored.
         """
         for n_waits in count(1):
             self.feedback.number_labels()
@@ -476,7 +481,7 @@ class Learner:
         The candidate is a trained version that is not in force yet. Returns a future of the
         version's number: the report's, or a higher one if another cell of the product stored a
         version first. Without a model only the report is stored, and the number is the report's.
-        Raises StoreError if the store is unavailable. With a store in memory it is kept there.
+        Raises StoreError if the store is unavailable. With a store in memory the future is done.
         """
         report = candidate.complete_report(self.live.next_version)
         newest_seq = self._window.newest_seq
@@ -557,8 +562,9 @@ class Learner:
         stored first, and the labels of all cells are read into the training window at the end. What
         is read is checked against the ledger; a difference sets the outbox's `integrity_error`,
         after which every part is verified. A pinned version or a correction discards a training
-        under way in the executor. After a newer version the new labels are counted from those that
-        it knows. Nothing happens in a cell without a product. Raises StoreError if the store is
+        under way in the executor. A model that cannot change the reference of a peer's correction
+        is not retrained here. After a newer version the new labels are counted from those that it
+        knows. Nothing happens in a cell without a product. Raises StoreError if the store is
         unavailable.
         """
         peers = self._peers
@@ -598,7 +604,8 @@ class Learner:
 
         If the model cannot change a reference and `may_retrain` is True, it is retrained in this
         thread, or, if it is pinned, fitted again as a new version; only the cell that corrected
-        does so. If the next training does not start from the model in force, because labels were
+        does so, and no training may be under way then (`end_training`). If the next training does
+        not start from the model in force, because labels were
         forgotten, its features are computed in advance (`_precompute_other_start`). The store is
         checked against its ledger; a difference sets the outbox's `integrity_error`, after which
         every part is verified. A damaged trace is reported by an event in the store. With no new

@@ -140,8 +140,9 @@ def add_labels_since(
     capacity: int,
     shared_to: int | None = None,
 ) -> int:
-    """Add labels to a version's restored model as references, if they are none yet.
+    """Add the labels since a version to its restored model as references, if they are none yet.
 
+    They came after the newest label that the version was trained on, or got with a rollback.
     They are the labels of all cells of the product up to number `shared_to`, and after it only this
     cell's own. None stands for the newest label that the version was trained on, or that it got
     with a rollback, so that an engine that opens a store counts what it counted before. At most the

@@ -140,7 +140,8 @@ class EngineSettings:
         name : str
             Of the store, for error messages.
         reducer, model : object, optional
-            Objects that the engine was made with and the store cannot name.
+            Objects that the engine was made with and the store cannot name. A reducer's name may be
+            passed, too; it is not compared.
         allow_import : bool or collection of str
             Whether any class that the recipe names may be imported, or which; a class that
             `reducer` names is allowed.
@@ -156,8 +157,9 @@ class EngineSettings:
             a recipe that lacks settings.
         SettingError
             If the stored text is no recipe, if an object is missing or differs from the one that
-            the engine was made with, or if a `model` is passed to an engine that has its own. Also
-            for a stored seed that is too large, and force limits that do not fit the `TraceSpec`.
+            the engine was made with, or if a `model` is passed to an engine that has its own, or
+            lacks a method of `Model`. Also for a stored seed that is too large, and force limits
+            that do not fit the `TraceSpec`.
         ImportRefusedError
             If the recipe names a class that may not be imported.
         """

@@ -445,13 +445,15 @@ def train_candidate(
 ) -> Trained:
     """Train a model on labelled traces and return the outcome.
 
-    The outcome has the model, a reason in words, the number of steps, the duration, and the numbers
-    of the labels. `successor` is the model, which this changes in place. No step begins after
+    The outcome has the model, a reason in words, the number of steps, the durations of all and of
+    the last step with all after it, and the sequence numbers of the labels.
+    `successor` is the model, which this changes in place. No step begins after
     `step_seconds` seconds or `max_steps` steps; None is no limit. Any exception, a window without
     traces, and a defect of the trained model give an outcome without a model, whose reason begins
     with "dropped: ". A training that reaches a limit ends early and is accepted; its reason says so
-    if the time budget ended it before its last step, and has the note of the model's report if
-    there is one. `clock` returns seconds. The modules that a training imports are loaded first;
+    if the time budget ended it before its last step. The reason of each accepted training has the
+    note (a line for the operator) of the model's report, if there is one.
+    `clock` returns seconds. The modules that a training imports are loaded first;
     their time does not count, and a failure of this is logged. Sets the present thread to one torch
     thread. It is a plain function, so that any executor can run it.
     """

@@ -95,8 +95,10 @@ class KeptReplays:
     def path(self, task: Task) -> Path:
         """Return the path of the file of a task's replay in the folder, whether or not it exists.
 
-        The name of the file is a hash of all that the decisions depend on: data, settings, seed,
-        source code and libraries.
+        The name of the file is a hash of what the decisions depend on: data, settings, seed,
+        libraries, and the source code of dengine and of the reducer's classes and functions. The
+        code of a decision rule or baseline of the user's own (`module:Class`), or of a base class
+        in another file, is not in it. A reducer that is a `module:Class` is imported.
 
         Raises
         ------
@@ -134,7 +136,7 @@ class KeptReplays:
 
     def get(self, task: Task) -> Replay | None:
         """Read the replay of a task from the folder and return it; None if there is none, or if its
-        file is damaged.
+        file is damaged or cannot be read.
 
         The replay gets the name and recipe of the task's contender, who played it. Raises
         SettingError as `path` does.
@@ -194,7 +196,7 @@ def _digest_of_source() -> str:
 def _source_of(class_or_function: Any) -> str:
     """Return the text of the source file of a class or function; "" if there is no readable file.
 
-    A file is read once in a process, so later changes of it are not seen.
+    It is read once in a process for each class or function; later changes are not seen.
     """
     try:
         return Path(getsourcefile(class_or_function) or "").read_text(encoding="utf-8")

@@ -350,8 +350,9 @@ class Replay:
             them, counted from 1. precision and npv, the shares of right decisions among the
             accepted and the rejected parts, and accuracy, among both. retrains, their number;
             retrains_dropped, the number of those that were dropped; dropped, the reason of the last
-            of these, or "". Median and largest time of a retrain (s), median and 99th percentile of
-            a decision's (µs), and the seconds of the replay. saved_s, the seconds of checks that
+            of these, or "". retrain_p50_s and retrain_max_s, the median and largest time of a
+            retrain; decide_p50_us and decide_p99_us, the median and 99th percentile of a
+            decision's, in µs; seconds, those of the replay. saved_s, the seconds of checks that
             the certain parts saved; and net_s, which is saved_s minus the cost of errors, in
             seconds, by the defaults of `Costs`.
 

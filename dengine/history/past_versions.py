@@ -158,7 +158,7 @@ def _score_novelty(stored: ModelVersion, item: StoredDecision | None) -> Novelty
     The gate calls a trace novel by its distance from the traces of the training. The result has
     four numbers (level, texture, distortion, gaps), of which at least one is above 1 for a novel
     trace. Returns None without a decision, if the decision's reason is not `Reason.NOVEL`, and if
-    the gate cannot be restored, because it was switched off or is of another release.
+    the gate cannot be restored, because it was switched off or is of another release of dengine.
     """
     if item is None or item.decision.reason is not Reason.NOVEL:
         return None

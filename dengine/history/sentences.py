@@ -235,7 +235,7 @@ def _bound_sentences(
         yield f"{counts}; {name} at alpha {error_level:g} bounds the success rate by {interval}."
     if bound.accept_threshold is None and bound.reject_threshold is None:
         why = circumstances.safe_mode
-        if not why and circumstances.thresholds is not None:
+        if not why and circumstances.thresholds is not None and policy.guarantee in RULES:
             why = "no level of evidence held yet"
         yield (
             f"Nothing could pass, whatever the bound: {why}."

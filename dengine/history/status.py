@@ -271,13 +271,13 @@ class Status:
 
         The first of these that applies: a fault of the store, lost data, safe mode, too many bad
         parts among the accepted, too many good parts among the rejected, the last 3 or more
-        retrains dropped, in the newest training that was accepted traces that nearly repeat
-        another, in shadow mode too many bad parts among those that the model would have accepted,
-        mostly novel traces, mostly parts outside the force limits, any error of the model. "Too
-        many" means that the confidence interval of their share lies above the tolerance: at the
-        policy's alpha for accepted parts (`bad_accepts`), at 95 % for the others, where a rejected
-        part of unknown outcome counts as bad. "Mostly" means more than half. Parts are counted over
-        the newest decisions alone.
+        retrains dropped, many traces that nearly repeat another (as the reason of the newest
+        accepted training says), in shadow mode too many bad parts among those that the model would
+        have accepted, mostly novel traces, mostly parts outside the force limits, any part for
+        which the model raised an exception. "Too many" means that the confidence interval of their
+        share lies above the tolerance: at the policy's alpha for accepted parts (`bad_accepts`), at
+        95 % for the others, where a rejected part of unknown outcome counts as bad. "Mostly" means
+        more than half. Parts are counted over the newest decisions alone.
         """
         newest = self.newest
         accepts = newest.bad_accepts
@@ -353,8 +353,8 @@ def status(store: SqlStore, last: int = NEWEST, watching: bool = False) -> Statu
 
     A damaged label among those since the newest retrain is left out, and an event is written to the
     store. An event is also written if the arrays of the newest version are read (with `watching`,
-    and if that version is no trained one) and are damaged; then those of the version before it are
-    taken.
+    and if a rollback, release or change of policy made it) and are damaged; then those of the
+    version before it are taken.
 
     Parameters
     ----------
@@ -378,7 +378,10 @@ def status(store: SqlStore, last: int = NEWEST, watching: bool = False) -> Statu
         settings, and if the database fails.
     SettingError
         For a stored recipe that cannot be read; with `watching` also if an object of the user's
-        class of rule cannot be made.
+        class of rule cannot be made. An error of the rule's constructor other than TypeError is
+        raised as it is.
+    ValueError
+        For a stored setting that must be a number and is none.
     """
     settings = store.settings.read()
     if "recipe" not in settings:

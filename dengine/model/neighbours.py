@@ -133,7 +133,9 @@ class Predictor(nn.Module):
         counted, and 0 excludes none. Returns the positions of action and reason in `ACTIONS` and
         `REASONS`, the bounds lower and upper of the success probability, the counts n_success and
         n_failure of the labels within the radius, and the embedding (K, d), divided by the scale of
-        each embedding space. A novel trace is verified without counting: its bounds are 0 and 1,
+        each embedding space. Several labels of one part may count as fewer. If the rule only sorts
+        parts and the reducer gives a probability of success (`RadiusNeighbours.scored`), both
+        bounds are this score. A novel trace is verified without counting: its bounds are 0 and 1,
         its counts are 0.
         """
         z = self.embed(x)
@@ -205,9 +207,9 @@ def _as_key(value: object) -> object:
     """Return a hashable key of an attribute for `structure_of`; None if it makes no difference.
 
     A list, tuple or dict gives its type and the sorted names and keys of its items. The key of an
-    item is the text of a constant, the shape of a tensor, and else its own `_as_key`. A function is
-    its own key: its address would not do, since another function may get it later. Any other value,
-    and so a constant outside a container, gives None.
+    item is the text of a constant (`CONSTANTS`, like a number or a text), the shape of a tensor,
+    and else its own `_as_key`. A function is its own key: its address would not do, since another
+    function may get it later. Any other value, and so a constant outside a container, gives None.
     """
     if isinstance(value, FUNCTIONS):
         return value
@@ -430,7 +432,7 @@ class ModelPrediction(EngineModel):
         A reducer that can go on from its last training does so. If there are more traces than the
         classifier's capacity, only the last become references. `index`, `scale` (the divisor of the
         points in each embedding space), `gate` (the novelty gate, disabled if `novelty` is 0),
-        `examples` (up to 8 of the traces), the note on repeated parts and `trace_shape` are
+        `examples` (up to 8 of the traces), the `repeats_note` of `report` and `trace_shape` are
         replaced, the decider is dropped and built anew when it is used, and the decision rule stays
         as it is. y (n,) are labels, 1 or 0; `hashes` (n,), of the parts, give the folds; `numbers`
         (n,), of the labels, are kept with the references; `stop` may end the reducer's training
@@ -549,7 +551,13 @@ class ModelPrediction(EngineModel):
         return decider
 
     def _eager_decider(self, encoder: Any, conditions: DecisionConditions | None) -> Decider:
-        """Return a decider in Python for `build_decider`, around an encoder of traces."""
+        """Return a decider that is not compiled, in evaluation mode, for `build_decider`.
+
+        `encoder` is the module that embeds, (B, C, T) -> (B, K, d), compiled or not. The decider
+        shares references, rule and novelty gate with this model. `conditions` are as in
+        `build_decider`. Raises SettingError if the force limits do not fit the traces, and
+        AttributeError if nothing was fitted.
+        """
         neighbours = self.classifier.neighbours_over(self.index, self.rule, self.spaces.scores)
         predictor = Predictor(encoder, torch.from_numpy(self.scale), self.gate, neighbours)
         conditions = conditions or DecisionConditions(self.trace_spec)
@@ -606,8 +614,9 @@ class ModelPrediction(EngineModel):
         both divided by the scale already; without both it is computed from the trace. A full index
         drops its oldest reference. `y` is 1 for success, 0 for failure; `number` is the sequence
         number of this label. Returns the reference point, float32 (d,), divided by the scale of the
-        space. Raises ValueError if it must be computed and nothing was fitted, otherwise
-        AttributeError if nothing was fitted.
+        space. If it must be computed, the trace's shape is not checked, and a decider is built and
+        kept if none is, which raises what `build_decider` raises (ValueError or AttributeError if
+        nothing was fitted). Otherwise raises AttributeError if nothing was fitted.
         """
         # The fold of a hash is also the space of its reference.
         fold = int(fold_of(hash_, self.n_spaces))
@@ -680,8 +689,10 @@ class ModelPrediction(EngineModel):
         """Return a model under another policy; it shares all that was trained.
 
         Its decision rule is new, has learned nothing and is not stale; its decider is not built
-        yet. This model does not change, except that a reference that is added to either is in both.
-        Raises SettingError if the rule cannot be made.
+        yet. This model does not change. But the two share reducer and references: a reference that
+        is added, relabelled or removed in one is so in the other, and `train` of one trains the
+        reducer of both; train a `successor`. Raises what `Policy.rule` raises, such as SettingError
+        if the rule cannot be made.
         """
         settings = {name: getattr(policy, name) for name in ("alpha", "lower_bound", "interval")}
         model = copy.copy(self)

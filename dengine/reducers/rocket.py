@@ -170,7 +170,7 @@ class Tower(NamedTuple):
         width : int
             W, the largest number of components.
         variance : float
-            Variance of all components together.
+            Variance of all components together, to which they are scaled.
         weights : Tensor of float32, shape (p, K)
             Weights of the given heads on the features.
         mean_logits : Tensor of float32, shape (K,)
@@ -356,9 +356,9 @@ class RocketReducer(ProbabilityReducer):
         """Make the module `net_` for traces of this shape, with kernels and classifier heads of 0.
 
         `towers_` and the cache of features become empty, `n_fits_` and `n_component_traces_` 0;
-        what a fit reports (`n_iter_`, `holdout_losses_`) stays. `average` is the number of
-        samples that are averaged to one. Raises SettingError for a parameter out of its range or
-        fewer than 2 samples.
+        what a fit reports (`n_iter_`, `holdout_losses_`) stays. `is_initialized_` becomes False
+        until the caller has set the kernels. `average` is the number of samples that are averaged
+        to one. Raises SettingError for a parameter out of its range or fewer than 2 samples.
         """
         self.check()
         self.trace_shape_ = (channels, samples)
@@ -633,9 +633,10 @@ class RocketReducer(ProbabilityReducer):
     def check(self) -> None:
         """Raise SettingError for a parameter out of its range.
 
-        All but `l2` are integers: `kernels`, `dilations`, `width` and `max_iter` from 1 to a
+        These are integers: `kernels`, `dilations`, `width` and `max_iter` from 1 to a
         billion, `regions` from 1 to 16, `groups` from 0 to 64, `n_components` 1 or 2, and `folds`
-        from 2 to 1000. `l2` is above 0.
+        from 2 to 1000. `l2` is above 0; TypeError is raised if it cannot be compared with 0.
+        `random_state` is not checked.
         """
         check_integers(
             self,

@@ -159,9 +159,10 @@ class RocketEncoder(nn.Module):
     def raw_features(self, x: Tensor) -> Tensor:
         """Raw traces (B, C, T) -> unscaled features (B, P) of tower 1, then those of tower 2.
 
-        The features of tower 1 are means of the outputs of kernels, limited to 0 to 1
-        (`ramp_features`). Those of tower 2 say which kernels of a group have the largest and the
-        smallest outputs (`competition_features`). If `groups` is 0, there is no tower 2.
+        The features of tower 1 are from 0 to 3: sums of two means of the outputs of kernels, each
+        output limited to 0 to 1 (`ramp_features`). Those of tower 2 say which kernels of a group
+        have the largest and the smallest outputs (`competition_features`). If `groups` is 0, there
+        is no tower 2.
         `scale_features` standardises the features.
         """
         values = self.read_taps(self.average_samples(x))
@@ -203,6 +204,7 @@ class RocketEncoder(nn.Module):
         A tap is an input of a kernel at one place in the trace; L counts the frames (the means of
         `average` samples). For each tap, `taps` has an index into a row of L frames, then the L - 1
         differences of successive frames, then a 0, which stands for what lies beyond the ends. The
+        taps of tower 1 come first, then those of tower 2 in the trace, then in its differences. The
         batch is the last axis, so that reading a tap copies a row.
         """
         batch = x.size(0)
@@ -369,8 +371,9 @@ def tap_positions(frames: int, dilations: int, places: int) -> NDArray[np.int64]
 
     A tap is one of the nine inputs of a kernel. The places are spaced evenly over the trace, and a
     kernel reads four inputs on each side of its place, a dilation apart. The dilations are spaced
-    evenly in their logarithm, from 1 to that at which a kernel spans the trace. `dilations` is the
-    largest D; D is smaller for short traces. For a tap beyond the ends of the trace the position is
+    evenly in their logarithm, from 1 to that at which a kernel spans the trace, and rounded down.
+    `dilations` is the largest D; D is smaller if some are then equal, as for short traces. With
+    ``dilations=1`` the only dilation is 1. For a tap beyond the ends of the trace the position is
     ``2 * frames - 1``, at which `RocketEncoder.read_taps` finds a zero.
     """
     widest = np.log2((frames - 1) / (TAPS - 1)) if frames > TAPS else 0.0  # spans the trace

@@ -563,7 +563,7 @@ class TorchReducer(ProbabilityReducer):
 
     @torch.inference_mode()
     def _embed_ramp(self) -> Floats:
-        """Return the points (1, K, d) of a fixed trace, which tell `set_state` another network.
+        """Return the points (1, K, d) of a fixed trace, by which `set_state` knows the network.
 
         It is a preprocessed trace whose channels rise from -1 to 1.
         """

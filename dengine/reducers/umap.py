@@ -157,9 +157,11 @@ class UmapEncoder(nn.Module):
     def strengths(self, distances: Tensor) -> Tensor:
         """Distances to the nearest references (B, n_neighbors) -> membership strengths, same shape.
 
-        A strength lies between 0 and 1 and is 1 for the nearest reference. The strengths of a row
-        sum to about ``log2(n_neighbors)``, as far as sigma between 0.001 and 100 times the mean
-        distance beyond the nearest allows; if all distances of a row are equal, all are 1.
+        A strength is ``exp(-beyond / sigma)``, where `beyond` is the distance less that of the
+        nearest reference; so it is 1 for the nearest. sigma is chosen for each row, from 0.001 to
+        100 times the row's mean of `beyond`, so that the strengths sum to about
+        ``log2(n_neighbors)``, as far as this range allows; if all distances of a row are equal,
+        all are 1.
         """
         beyond = distances - distances.amin(1, keepdim=True)
         beyond = beyond / (beyond.mean(1, keepdim=True) + 1e-12)
@@ -376,9 +378,10 @@ class UmapReducer(Reducer):
 
         It finds neighbours (from those of `precompute` or of the last training), joins them to a
         graph, and moves the points for `n_epochs` epochs (None: `n_epochs_due`), or fewer if `stop`
-        ends them. Without numbers all traces count as new. Neighbours, points and encoder are
-        replaced, and the counters of epochs grow. Noise and negative samples follow from `seed_`
-        and `n_steps_`.
+        ends them. Without numbers all traces count as new. If more than half of them are new, the
+        layout starts anew, and `n_epochs_` from 0. Neighbours, points and encoder are replaced,
+        what `precompute` found is dropped, and the counters of epochs grow. Noise and negative
+        samples follow from `seed_` and `n_steps_`.
         """
         if numbers is None:
             numbers = np.arange(-len(traces), 0)  # numbers that no label has

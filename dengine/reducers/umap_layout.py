@@ -208,8 +208,9 @@ def attraction(points: Tensor, edges: Edges, a: float, b: float) -> tuple[Tensor
     """Compute the pull of each point towards its neighbours.
 
     An edge pulls with the coefficient ``4 a b d^(2b - 2) / (1 + a d^(2b))`` times its strength,
-    along the offset to the neighbour, where d^2 counts as 1e-8 at least; this is the negative
-    gradient of the cross entropy. The factor is 4, not 2, since umap-learn moves both ends of an
+    along the offset to the neighbour. Here d is the distance between the two, and d^2 counts as
+    1e-8 at least. This is the negative gradient of the edge's term in the cross entropy, twice. The
+    factor is 4, not 2, since umap-learn moves both ends of an
     edge and holds each edge twice.
 
     Parameters
@@ -226,7 +227,7 @@ def attraction(points: Tensor, edges: Edges, a: float, b: float) -> tuple[Tensor
     pull : Tensor of float32, shape (d, n)
         Direction and size of the move; the points are not moved here.
     stiffness : Tensor of float32, shape (n,)
-        For each point the sum of the coefficients of its edges.
+        For each point the sum over its edges of coefficient times strength.
 
     References
     ----------
@@ -273,8 +274,8 @@ def negative_samples(
 def repulsion(points: Tensor, samples: Tensor, a: float, b: float) -> Tensor:
     """Compute the mean push of each point away from its negative samples.
 
-    A sample pushes with ``2 b / ((0.001 + d^2) (1 + a d^(2b)))`` times the offset, whose
-    coordinates are then clipped at ±4.
+    A sample at the distance d pushes with ``2 b / ((0.001 + d^2) (1 + a d^(2b)))`` times the offset
+    from it. Each coordinate of this push is clipped at ±4, before the mean is taken.
 
     Parameters
     ----------

@@ -239,9 +239,9 @@ def _response_type(
     """Make and return a msgspec struct type named `name`, which describes a response.
 
     It has the fields of the dataclass `record`, if one is given, except those in `without`, with
-    their types in JSON. It also has the fields of `more`, given as types by name; they replace
-    fields of the record with the same name. No field has a default. Its docstring is `about`,
-    followed by the docstring of the record.
+    their types in JSON (`_json_field_types`, which leaves fields out that are marked as "apart").
+    It also has the fields of `more`, given as types by name; they replace fields of the record with
+    the same name. No field has a default. Its docstring is `about`, followed by that of the record.
     """
     members = _json_field_types(record) if record else {}
     types = {key: hint for key, hint in members.items() if key not in without}
@@ -422,9 +422,10 @@ def problem_response(
     """Return the response to a request that is not served, in JSON with the fields of `Problem`.
 
     These are the status, its title, the detail, the action "verify" and the type "about:blank". The
-    detail is put on one line, and passwords of URLs in it are masked. `headers` are added to the
-    response; with status 503 it also has the header Retry-After, with 1 second, unless they have
-    it. Raises ValueError for a status that HTTP does not know.
+    media type is application/problem+json. The detail is put on one line, and passwords of URLs in
+    it are masked. `headers` are added to the response; with status 503 it also has the header
+    Retry-After, with 1 second, unless they have it. Raises ValueError for a status that HTTP does
+    not know.
     """
     retry = {"Retry-After": str(RETRY_SECONDS)} if status == 503 else {}
     line = " ".join(without_password(detail).split())

@@ -193,7 +193,8 @@ class HttpApi:
 
         Raises HTTPException 422 for both or neither, UnknownDecisionError for a part without a
         decision, and ReportConflictError for a part with several (rejects count only if there is
-        nothing else). A decision's id in place of the part's number is found, too. For a part it
+        nothing else). Only the newest 20 decisions on the part are looked at. A decision's id in
+        place of the part's number is found, too, if no part has this number. For a part it
         waits in the queue, and raises BusyError if that is full or the service is closing, and
         StoreError. An id is not looked up.
         """

@@ -161,9 +161,10 @@ class LabelTable(CellTable):
         """Return this cell's labels as they were recorded, oldest first.
 
         Labels of quarantined traces, which no version is trained on, are included, and so are
-        forgotten ones. A label that is not as it was stored is left out, and an event with the id
-        of its decision is written to the store, or logged if the store cannot be written. A label
-        without its decision is left out, too, without an event.
+        forgotten ones. Labels that are not as they were stored are left out. One event with the ids
+        of their decisions, eight at most, is written to the store, unless the cell has the same
+        event already; it is logged if the store cannot be written. A label without its decision is
+        left out, too, without an event. Whether decisions are as they were stored is not checked.
 
         Parameters
         ----------

@@ -199,7 +199,8 @@ def newest_entry(connection: sa.Connection, cell_id: str) -> Any:
 def rows_digest(sums: Mapping[str, Iterable[bytes]]) -> bytes:
     """Return the SHA-256 (32 bytes) over the checksums of rows (`row_sum`), given by table.
 
-    Neither the order of the tables nor that of the rows matters.
+    Neither the order of the tables nor that of the rows matters. A table without rows is part of
+    the digest, too: without it the digest is another one.
     """
     digest = hashlib.sha256()
     for table in sorted(sums):
@@ -402,7 +403,8 @@ def _find_table_error(
     """Compare a cell's rows of the table `name` with the ledger.
 
     Return the first difference in words, or "". A difference is a row whose values do not fit its
-    stored sum, or rows that were removed, added or replaced. `chained` is the chain of the table,
+    stored sum, or rows that were removed, added or replaced. The stored states of versions are not
+    read. `name` is that of a table in IN_FORCE. `chained` is the chain of the table,
     the digest over all its rows so far, that ledger entry `last_entry` has. Rows of later entries
     are not read, since another connection may write meanwhile. Reading begins at number `first`, or
     at an earlier row that belongs to the same ledger entry.

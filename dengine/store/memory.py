@@ -117,7 +117,8 @@ class MemoryStore(Outbox):
         written to the database together with the other records, when somebody uses the store, or
         when 40 retrains wait: packing a retrain takes as long as many decisions. Raise StoreError
         if `report.accepted` is True and there are no arrays, for an array of Python objects, and if
-        40 retrains wait and the database cannot be written.
+        40 retrains wait and the database cannot be written. In this last case all that waited and
+        was not written by then is lost, records included.
         """
         self._versions.append((report, last_seq, check_state(report, state), self.store.clock()))
         if len(self._versions) == MAX_UNWRITTEN_VERSIONS:

@@ -51,8 +51,8 @@ LOCK = _lock_of_system()
 def open_plain(path: Path, flags: int) -> int:
     """Open a file with the flags of `os.open` in binary mode, and return its descriptor.
 
-    A new file is readable and writable by its owner alone. Raise OSError for a symbolic link, and
-    if the system refuses.
+    A new file is readable and writable by its owner alone, but on Windows it has the rights that
+    its folder gives. Raise OSError for a symbolic link, and if the system refuses.
     """
     no_follow = getattr(os, "O_NOFOLLOW", 0)
     binary = getattr(os, "O_BINARY", 0)  # or Windows writes \r\n for \n

@@ -156,8 +156,8 @@ def join_product(connection: sa.Connection, cell_id: str, product: str | None) -
     ------
     StoreError
         If the cell has another product. Of a cell without a product, if the name is blank or not
-        printable, and if the cell has settings or labels already: its labels were numbered without
-        those of the other cells.
+        printable, and if the cell has labels already, or settings other than those that the store
+        itself keeps (`RESERVED`): its labels were numbered without those of the other cells.
     """
     stored = read_setting(connection, cell_id, PRODUCT_KEY)
     if product is None or stored == product:
@@ -198,7 +198,7 @@ WITH_TRACES = DECISION.outerjoin(TRACE, TRACE_OF_DECISION)
 def corrected_label(corrected_to: int | None = None) -> sa.ColumnElement[int | None]:
     """Return the SQL column of a label after corrections: 0, 1 or FORGOTTEN (2).
 
-    It is NULL without a label.
+    It is NULL without a label. The query that uses it must have the table `label`.
 
     Parameters
     ----------

@@ -53,6 +53,7 @@ EntryName = tuple[int, str]  # number and digest, hexadecimal, of a ledger entry
 NO_TRACE: TraceArray = np.zeros((0, 0), dtype=np.float32)
 # The first label and a second one that replaces it: silence confirmed the part, then it stopped the
 # line.
+LABEL_TEXTS = {True: "success", False: "failure", None: "a forgotten label"}
 LATE_STOP = (True, Source.CONFIRMED), (False, Source.STOP)
 LABEL_WORDS = {True: "good", False: "bad", None: "none"}
 FORGOTTEN = 2  # beside 0 and 1: a label that takes part in nothing any more
@@ -79,7 +80,7 @@ def unknown_decision(decision_id: str) -> UnknownDecisionError:
 
 
 def already_reported(
-    decision_id: str, first: tuple[bool, Source], second: tuple[bool, Source]
+    decision_id: str, first: tuple[bool | None, Source], second: tuple[bool, Source]
 ) -> ReportConflictError:
     """Return the error for a second label of a decision; it names both labels.
 
@@ -89,18 +90,20 @@ def already_reported(
     ----------
     decision_id : str
     first, second : (bool, Source)
-        Success and source of the label that stands, and of the one that came now.
+        Success and source of the label that stands, and of the one that came now. None in the place
+        of the first success is a forgotten label, which only a correction brings back.
 
     Returns
     -------
     ReportConflictError
     """
     stored, new = (
-        f"{'success' if success else 'failure'} from {source.value}"
-        for success, source in (first, second)
+        f"{LABEL_TEXTS[success]} from {source.value}" for success, source in (first, second)
     )
     advice = "nothing more needs reporting"
-    if first[0] != second[0]:
+    if first[0] is None:
+        advice = "if it is to count again, correct it"
+    elif first[0] != second[0]:
         advice = "if the first was wrong, look at how the part was checked"
     return ReportConflictError(
         f"Expected one report a decision, got a second on {decision_id!r}: {stored} was reported "
@@ -523,8 +526,8 @@ def columns(record_type: Any) -> dict[str, tuple[type, bool]]:
     """Return, by name, the type of each field of a record class, and whether it may be None.
 
     A record class is a dataclass or NamedTuple with type hints. The type is a plain one: that of
-    `dict[str, int]` is `dict`, and of a union, which must be one with None as the last, it is the
-    first. The result is cached; do not change it.
+    `dict[str, int]` is `dict`, and that of a union is its first. A union must be written with `|`,
+    and have None as the last. The result is cached; do not change it.
     """
     fields: dict[str, tuple[type, bool]] = {}
     for name, hint in get_type_hints(record_type).items():

@@ -150,8 +150,8 @@ def verify_history(
     checked cells has. Of missing entries and of SQLite's findings only the first 20 and 100 are
     returned. A journal that is missing or cannot be read is no fault: `waiting` of the cell is None
     then. Of the settings that the store itself keeps (`RESERVED`) a changed product is not noticed.
-    An SQLite file that was not in WAL mode is set to it (`reading`). Takes about 40 bytes of memory
-    per row.
+    An SQLite file that was not in the mode WAL, a write-ahead log, is set to it. Takes about 40
+    bytes of memory per row.
 
     Parameters
     ----------
@@ -177,7 +177,8 @@ def verify_history(
     StoreError
         For what is no store of the present schema, for an unknown cell, for an `expect` that is no
         digest, and for a ledger with another key than the one that DENGINE_LEDGER_KEY names, or if
-        the key's file cannot be read, or the disk fails while a journal is read.
+        the key's file cannot be read or has fewer than 16 bytes, or the disk fails while a journal
+        is read.
     """
     expected = "" if expect is None else expect.strip().lower()
     if expect is not None and not re.fullmatch("[0-9a-f]{8,64}", expected):
@@ -335,7 +336,8 @@ class CellCheck:
     def _read_raw(self, table: str) -> Iterator[Row]:
         """Yield the cell's rows of a table as dicts, with values as the driver returns them.
 
-        SQLAlchemy converts nothing, so that damaged values can be read, too.
+        They are in no order. SQLAlchemy converts nothing, so that damaged values can be read, too.
+        Its DatabaseError is raised, also after some rows, if the table cannot be read to its end.
         """
         # SQLAlchemy knows no types here, so it converts none.
         query = sa.text(f'SELECT * FROM "{table}" WHERE cell_id = :cell')

@@ -238,7 +238,8 @@ def _wall_xml(side: int, half: float, chamfer: float, depth: float) -> str:
 
     A wall is three boxes, one of which is the chamfer. Wall 0 is at +x; wall `side` (0 to 3) is
     turned by `side` quarter turns about z. The half width `half` of the hole, the width of the
-    chamfer and the depth of the hole are in metres.
+    chamfer and the depth of the hole are in metres. The rim is at z = 0. Angles in the text are in
+    radians, so the model needs MuJoCo's `<compiler angle="radian"/>`.
     """
     wall = _WALL_MM / 1000
     reach = half + chamfer + wall

@@ -164,7 +164,8 @@ class UrCell(AbstractContextManager["UrCell"]):
         start was lost or the trigger is wrong; one that is not complete when the time for the order
         is over has NaN for the rest. `last` becomes the record of this insertion (trace and missing
         samples); a trace with missing samples is counted in `incomplete`. Raise CellError if the
-        robot does not answer in time, fails, or its program stops.
+        robot does not answer in time, fails, or its program stops; `last` is then None, or the
+        insertion if it was complete before, and nothing is counted.
         """
         self._execute_order(Verb.INSERT)
         if self.last is None:  # the start was lost, or the trigger is wrong

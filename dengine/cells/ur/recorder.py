@@ -184,8 +184,8 @@ class RtdeRecorder(AbstractContextManager["RtdeRecorder"]):
     def feed(self, row: Row) -> InsertionRecord | None:
         """Add a package of the stream, `row`; return the insertion that it completes, else None.
 
-        An insertion begins when the trigger goes on after its `quiet_s`, and is complete with the
-        first package at or after its last sample, within half a step.
+        An insertion begins when the trigger goes on after it was off for `quiet_s` seconds. It is
+        complete with the first package of the time of its last sample, less half a step, or later.
 
         Samples that were lost are NaN in the trace; all samples are NaN if packages are missing
         where the insertion began, so that its start is unknown. If the clock of the controller went

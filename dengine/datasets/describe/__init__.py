@@ -65,9 +65,9 @@ def describe(source: Any, stated: Stated | None = None) -> Description:
         A folder, a file or a table of recordings.
     stated : mapping, optional
         Keys whose values are known, like `{"label.column": "verdict"}`, or sections with such keys.
-        They are kept, except for the value `?`, and for keys in `ignored`, which is proposed anew
-        for all files but bags; `[rows]` may get further columns and words. The proposals for the
-        other keys follow from them.
+        They are kept, but a key with the value `?` counts as not stated, `ignored` is proposed
+        anew, and `[rows]` may get further columns and words. The proposals for the other keys
+        follow from them.
 
     Returns
     -------
@@ -86,6 +86,8 @@ def describe(source: Any, stated: Stated | None = None) -> Description:
         in `[text]` or `[time]` that no file can be read with.
     SettingError
         If a stated `windows.trigger`, which cuts long recordings, is malformed.
+    ValueError
+        If the index of a DataFrame is named like one of its columns.
     """
     source = as_source(source)
     stated = {key: value for key, value in flat("", stated or {}).items() if value != UNKNOWN}

@@ -83,14 +83,16 @@ def is_clock(column: Column) -> bool:
     Dates and times of day may if they change within a recording. So may a column that is named like
     a clock (`time`, `stamp`, `t`, ...), if not all its cells are numbers and they change within a
     recording, or if all are numbers that rise and it has no unit of another quantity, like N. They
-    may fall in at most 10 % of the steps, like a counter that begins again.
+    may fall in at most 10 % of the steps, like a counter that begins again, or in at least 90 %, if
+    the newest row is the first.
     """
     is_named = NAME.search(column.name) is not None
     if column.forms or (is_named and column.odd):
         return not column.fixed
     if not is_named or quantity_of(column.unit):
         return False
-    return bool((column.steps > 0).any() and (column.steps < 0).sum() <= FEW * len(column.steps))
+    falls = (column.steps < 0).mean() if column.steps.any() else 0.5
+    return bool(abs(falls - 0.5) >= 0.5 - FEW)
 
 
 def form_of(column: Column, p: Proposal, is_alone: bool) -> str:
@@ -131,7 +133,7 @@ def _unit_by_size(column: Column, p: Proposal) -> str:
     the possible units. It is `?`, too, if the column has no numbers that rise; the note then asks
     for the form of its cells.
     """
-    rising = column.steps[column.steps > 0]
+    rising = np.abs(column.steps[column.steps != 0])  # or falling, with the newest row first
     if not len(rising):
         odd = listed([*column.odd][:3])
         p.notes["time.format"] = (
@@ -161,8 +163,9 @@ def is_rate(step: float) -> bool:
 def propose_rate(p: Proposal, tables: Tables) -> None:
     """Set `time.rate_hz` in `p`, from the median over the recordings of the mean step of time.
 
-    `tables` has the samples of each recording. Steps below 0 are left out of the mean, and the rate
-    is rounded to five digits. It is `?`, with a note, if it is not between 1 Hz and 1 MHz; then
+    `tables` has the samples of each recording. If the times of more than 90 % of them end before
+    they begin, `time.sort` is set. Steps below 0 are left out of the mean, and the rate is rounded
+    to five digits. It is `?`, with a note, if it is not between 1 Hz and 1 MHz; then
     `time.gap`, the longest step that is allowed, is not looked at. Otherwise `check_steps` checks
     the times, by the rate and the gap that the description has by then. If it refuses more
     recordings than 10 % plus one, `time.gap` is set to `?`, with a note on the first. If all
@@ -175,8 +178,11 @@ def propose_rate(p: Proposal, tables: Tables) -> None:
     clocks = list[tuple[Table, Floats, float]]()
     for table in tables:
         with suppress(UnreadableError):
-            seconds, start = times_of(table, clock, p.description.text)
-            clocks.append((table, np.sort(seconds) if clock.sort else seconds, start))
+            clocks.append((table, *times_of(table, clock, p.description.text)))
+    if clocks and np.mean([seconds[-1:] < seconds[:1] for _, seconds, _ in clocks]) > 1 - FEW:
+        p.put("time.sort", True, "the newest row is the first")
+    if p.description.time.sort:
+        clocks = [(table, np.sort(seconds), start) for table, seconds, start in clocks]
     rising = [steps[steps >= 0] for steps in (np.diff(seconds) for _, seconds, _ in clocks)]
     if min((start for *_, start in clocks), default=0.0) > YEARS[0]:
         p.put("order", "time")

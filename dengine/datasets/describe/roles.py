@@ -12,7 +12,7 @@ import numpy as np
 from ...errors import DataError, listed
 from ..description import ANY, UNKNOWN, LabelSource, PartSource, RowWords, expect_one_of
 from ..read.files import natural_key
-from ..read.recordings import kept_rows
+from ..read.recordings import is_dropped, kept_rows
 from ..read.split import match_numbered
 from ..units import quantity_of
 from .clock import NAME as CLOCK_NAME
@@ -26,6 +26,7 @@ SPARSE = 0.1
 STRANGE = 0.01
 PART_LINE = re.compile(r"(?i)serial|barcode|dmc|part ?(no|num|id)|teilenummer|werkst.ck|serien")
 QUALIFIER_NAME = re.compile(r"(?i)status|valid|quality|flag|error|state")
+SIGNAL = re.compile(r"(?i)(force|kraft|torque|drehmoment|load|last)([_ ]?[xyz])?")
 COUNTER_NAME = re.compile(r"(?i)(index|row|sample|n|i|punkt|point|count|nr|no|line)s?")
 LOADS = ("force", "torque")
 SET_VALUE = re.compile(r"(?i)(^|[^a-z])(set|soll|max|min|limit)")
@@ -73,14 +74,14 @@ def propose_roles(p: Proposal) -> None:
 def set_rows(p: Proposal, rows: Mapping[str, RowWords]) -> None:
     """Set `[rows]` in `p`, and leave the rows that are no samples out of its tables and columns.
 
-    A column of `rows` with `?` is left aside, and a recording that lacks one of the others, or has
-    a word without a meaning there, keeps all rows. Nothing changes if `rows` is empty.
+    A column of `rows` with `?` in its `keep` is left aside. A recording keeps all rows if it lacks
+    one of the others, or has a word without a meaning there. Nothing changes if `rows` is empty.
     """
     if not rows:
         return
     p.description = replace(p.description, rows=rows)
     certain = {name: about for name, about in rows.items() if UNKNOWN not in about.keep}
-    tables = [*p.tables]
+    tables = [table for table in p.tables if not is_dropped(table, certain)]
     for i, table in enumerate(tables):
         with suppress(DataError):
             tables[i] = kept_rows(table, certain)[0]
@@ -125,12 +126,13 @@ def qualify_rows(p: Proposal) -> None:
 def qualifies(column: Column, n_rows: int) -> bool:
     """Return whether the words of a column may tell which rows are samples.
 
-    It must have at most 12 different words, they must change within a recording, and it must have a
-    cell in each of the `n_rows` rows of all recordings. A column that is named like a status
-    (`Status`, `valid`) may have numbers, and also just one word in all. Any other must have texts,
-    or empty cells if it is named like a verdict, and no name like a clock. A column that is named
-    like a verdict and has one word in each recording, of which any is known to mean good or bad,
-    holds labels instead, and gives False.
+    It must have at most 12 different words, and a cell in each of the `n_rows` rows of all
+    recordings, or one for each recording. The words must change within a recording, or one of
+    several must name a force or a torque. A column that is named like a status (`Status`, `valid`)
+    may have numbers, and also just one word in all. Any other must have texts, or empty cells if it
+    is named like a verdict, and no name like a clock. A column that is named like a verdict and has
+    one word in each recording, of which any is known to mean good or bad, holds labels instead, and
+    gives False.
     """
     name = column.name
     words = column.counts
@@ -138,8 +140,9 @@ def qualifies(column: Column, n_rows: int) -> bool:
     is_verdict = NAME.fullmatch(name) is not None
     has_words = any(column.odd) or (is_verdict and column.odd)  # or beside empty cells, a number
     is_text = has_words and not CLOCK_NAME.search(name)
-    varies = not column.fixed or (is_named and len(words) == 1)
-    is_full = words.total() == n_rows
+    is_signal = len(words) > 1 and any(SIGNAL.fullmatch(word) for word in words)
+    varies = not column.fixed or is_signal or (is_named and len(words) == 1)
+    is_full = words.total() in (n_rows, len(column.fixed))  # a cell for each row, or recording
     if not (is_named or is_text) or not varies or not is_full or len(words) > MOST_WORDS:
         return False
     return not (is_verdict and column.fixed and has_meaning(LabelSource(column=name), words))
@@ -190,9 +193,10 @@ def propose_channels(p: Proposal, units: Mapping[str, str]) -> None:
 def _doubt_on(p: Proposal, name: str) -> str:
     """Return the first reason why a column may not be a channel; "" if there is none.
 
-    The reasons: the column is named like a set value or a limit; `name` is like `x*` and stands for
-    the columns `x0`, `x1`, ..., and a step between two of their numbers differs from the first step
-    by more than half of it.
+    The reasons: the column is named like a value that a controller aims at or like a limit
+    (`F_soll`, `set_force`, `F_max`); `name` is like `x*` and stands for the columns `x0`, `x1`,
+    ..., and a step between two of their numbers differs from the first step by more than half of
+    it.
     """
     if SET_VALUE.search(name):
         return f"{name} may be a set value"
@@ -253,7 +257,8 @@ def propose_lengths(p: Proposal) -> None:
 
     The length is that of the first channel. Recordings without rows are ignored, and without a
     channel it is 0. If some have another length, and `traces.lengths` is not stated, a note counts
-    them; if they are more than 10 %, `traces.lengths` becomes `pad`.
+    them; if they are more than 10 %, `traces.lengths` becomes `pad`. A stated `traces.samples`
+    stays.
     """
     first = [p.columns[name] for name in p.description.channels][:1]
     lengths = [len(words) for column in first for words in column.words if len(words)]

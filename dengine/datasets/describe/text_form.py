@@ -58,10 +58,10 @@ def look(content: bytes, stated: Stated) -> Look:
     The result has the text form, the number of columns, the line of the header ("" for none) and
     the cells of each line from the first row of samples on, also of lines of another form. The
     delimiter and the first row follow from the first 200 lines; of delimiters with equal scores the
-    one with more cells is taken. If no delimiter separates numbers, there is a single column. The
-    marks in numbers stay those of `TextForm`. `content` has the bytes of the file. Raises DataError
-    if it is empty or no text, or if the line of its header is not certain, and LookupError for a
-    stated encoding that Python does not know.
+    one with more cells is taken. If none splits the usual line into cells, there is a
+    single column, and the delimiter is a comma. The marks in numbers stay those of `TextForm`.
+    `content` has the bytes of the file. Raises DataError if it is empty or no text, or if the line
+    of its header is not certain, and LookupError for a stated encoding that Python does not know.
 
     stated : keys that the user gave. `text.encoding` and `text.delimiter` are taken; `text.header`
     only says that a doubt about the header is no error.

@@ -66,10 +66,10 @@ def read_bag(
 
     Its columns are the channels, `log_time`, the time of the log, and `stamp`, that in the
     message's header, 0 without one; both are in nanoseconds. Other topics that the description
-    names are columns, too. If a topic is a label, each of its messages stands in the last row that
-    is not later, other rows have None; of several messages for one row the first stands there, and
-    those before the first row are left out. Any other topic has its newest message in each row,
-    None before the first.
+    names are columns, too; a cell is the field `data` of a message. If a topic is a label, each of
+    its messages stands in the last row that is not later, other rows have None; of several messages
+    for one row the first stands there, and those before the first row are left out. Any other topic
+    has its newest message in each row, None before the first.
 
     Parameters
     ----------

@@ -58,11 +58,12 @@ def path_word(path: str, pattern: str) -> str:
 
 
 def line_word(lines: Sequence[str], beginning: str) -> str:
-    """Return what follows `beginning` in a line that begins with it, up to `;`, tab or comma.
+    """Return the word behind `beginning` in a line that begins with it, "" if there is none.
 
     If several lines begin with it, the first is used in which it fills the whole first cell, or
-    else the first. Comment marks and quotes before the text are skipped; blanks, quotes, colons and
-    `=` around the result are removed. Raises UnreadableError if no line begins with the text.
+    else the first. Comment marks, quotes and delimiters before `beginning` are skipped. So are
+    blanks, tabs, quotes and `; , : =` behind it; then the word goes up to the next `;`, tab or
+    comma, without such marks at its end. Raises UnreadableError if no line begins with the text.
 
     lines : the lines above the header of a file.
     """
@@ -81,8 +82,8 @@ def words_of(
     If the source states a path or a line above the header, that gives one word; otherwise each of
     `columns` of the recording's table gives one, "" for an empty cell: that of all rows if `at` is
     "same", or of the "first" or "last" row. Raises UnreadableError if a column, the line or a match
-    is missing, or if rows differ under "same", and DataError if the path is no regular expression
-    with one group.
+    of the path is missing, if a column has lists or no rows, or if rows differ under "same", and
+    DataError if the path is no regular expression with one group.
     """
     if source.path:
         return [path_word(table.path, source.path)]
@@ -115,7 +116,7 @@ def listing_table(path: Path, form: TextForm) -> Table:
     know.
     """
     content = read_file(path)
-    if path.suffix == ".parquet":
+    if path.suffix.lower() == ".parquet":
         return read_parquet(content, path.name)
     header = to_utf8(content, form.encoding).decode().partition("\n")[0]
     plain = TextForm(form.encoding, max(DELIMITERS, key=header.count))

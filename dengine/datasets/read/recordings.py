@@ -5,7 +5,7 @@ a `Dataset`. What does not follow the description becomes a `Fault`.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ from ...traces import can_fit_length, fit_length
 from ..checks import check_description, without_repeats
 from ..dataset import Dataset, Fault, make_dataset, unit_text
 from ..description import ANY, ORDERS, Channel, Description, RowWords, TextForm
-from ..table import Cells, Recording, Table, UnreadableError
+from ..table import Cells, Recording, Table, UnreadableError, as_word
 from ..units import bare, conversion, unit_in
 from .bags import read_bag
 from .clock import check_steps, times_of
@@ -111,11 +111,12 @@ def kept_rows(table: Table, rows: Mapping[str, RowWords]) -> tuple[Table, Cells]
     n = max(map(len, table.columns.values()), default=0)
     is_lost: Cells = np.zeros(n, dtype=bool)
     for column, about in rows.items():
-        kind_of = {word: kind for kind, words in asdict(about).items() for word in words}
-        other = kind_of.get(ANY, "")
-        words = table.words(column).tolist()
-        kind = np.array([kind_of.get(word, other) for word in words], dtype=object)
-        table.refuse(kind == "", f"one of the words {listed(sorted(kind_of))}", column)
+        words = table.words(column)
+        kind_of = {word: about.kind(word) for word in {*words}}
+        kind = np.array([kind_of[word] for word in words], dtype=object)
+        wanted = f"one of the words {listed(sorted(about.keep + about.drop + about.invalid))}"
+        table.refuse(kind == "", wanted, column)
+        kind = np.broadcast_to(kind, is_lost.shape)  # one cell holds for all rows
         is_kept = kind != "drop"
         is_lost = (is_lost | (kind == "invalid"))[is_kept]
         table = table.take(is_kept)
@@ -149,9 +150,10 @@ def label_of(labels: Sequence[LabelReader], table: Table, part: str) -> int | No
 
     `labels` has a reader for the source of labels, and for each source that must agree with it;
     `table` and `part` are the table and the number of the part. A reader of a listing adds the key
-    that it found to its `used`. Raises UnreadableError if a source has no label for the part or
-    contradictory rows, or if the sources do not agree, also if only one of them says that it was
-    not checked, and DataError if the path of a source is no regular expression with one group.
+    that it found to its `used`. Raises UnreadableError if a source has no label for the part, a
+    word without a stated meaning or contradictory rows, or if the sources do not agree, also if
+    only one of them says that it was not checked, and DataError if the path of a source is no
+    regular expression with one group.
     """
     label, *others = [reader.label(table, part) for reader in labels]
     for i, other in enumerate(others, 1):
@@ -264,15 +266,27 @@ def parts_of(file: str | Table, description: Description, base: Path) -> Iterato
     """Yield the tables of the parts in a file, or in a table that was read already.
 
     Each table that `split` yields is one part, or, if `[windows]` is stated, a long recording that
-    is cut into parts. `base` is the folder of the file, and of the listing in `[windows]`. Raises
-    UnreadableError or DataError if the file cannot be read, DataError if it cannot be split, or one
-    of its recordings cannot be cut (those before it are yielded), and SettingError if
-    `windows.trigger` is malformed.
+    is cut into parts. One that `[rows]` drops by a single cell is left out (`is_dropped`). `base`
+    is the folder of the file, and of the listing in `[windows]`. Raises UnreadableError or
+    DataError if the file cannot be read, DataError if it cannot be split, or one of its recordings
+    cannot be cut (those before it are yielded), and SettingError if `windows.trigger` is malformed.
     """
     if not isinstance(file, Table):
         file = table_of(read_file(base / file), file, description)
     for part in split(file, description):
-        yield from cut(part, description, base) if description.is_cut else [part]
+        if not is_dropped(part, description.rows):
+            yield from cut(part, description, base) if description.is_cut else [part]
+
+
+def is_dropped(part: Table, rows: Mapping[str, RowWords]) -> bool:
+    """Return whether a part has one cell in a column of `[rows]`, whose word drops its rows.
+
+    So has a row of a wide table with the samples of another signal.
+    """
+    cells = {name: part.columns.get(name, ()) for name in rows}
+    return any(
+        len(c) == 1 and rows[name].kind(as_word(c[0])) == "drop" for name, c in cells.items()
+    )
 
 
 def dataset_of(recordings: Sequence[Recording], description: Description) -> Dataset:

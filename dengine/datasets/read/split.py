@@ -24,8 +24,9 @@ def table_of(content: bytes, name: str, description: Description) -> Table:
 
     Any other format than `ts`, `json`, `jsonl`, `parquet` and `npz` is read as text. `content` has
     the bytes of the file, and `name` is its name in errors. Raises UnreadableError or DataError if
-    the file does not have this format, and DataError without pyarrow for a Parquet file; for a text
-    file also SettingError if `windows.trigger` is malformed.
+    the file does not have this format, and DataError without pyarrow for a Parquet file. Raises
+    LookupError for an encoding that Python does not know, and for a text file SettingError if
+    `windows.trigger` is malformed.
     """
     kind = description.format
     form = description.text
@@ -99,10 +100,12 @@ def split(table: Table, description: Description) -> Iterator[Table]:
     order of these numbers. Otherwise the file is one part.
 
     In numbered columns and in the layout `columns`, empty cells at the end are no samples. A part
-    has `damage` if one of its rows is damaged (`long`: or one directly before or behind it), if the
-    items of a list in its row are not alike, or if rows of other parts stand between its own
-    without `time.sort`; in `columns` and for a whole file, if the file has any. Raises DataError if
-    `part.column` of the layout `long` is not stated or not in the table.
+    has `damage` if its row is damaged, or if a list of lists or mappings in it has items of
+    different keys, kinds or lengths. In `long` damaged rows are in no part; a part has damage if
+    one stands between its first and last row or directly beside these, or if rows of other parts
+    stand between its own without `time.sort`. In `columns` and for a whole file, all damage of the
+    file counts. Raises DataError if `part.column` of the layout `long` is not stated, is not in the
+    table or has lists as cells.
     """
     table = replace(table, path=table.source)
     layout = description.layout
@@ -206,8 +209,9 @@ def _split_columns(table: Table, description: Description) -> Iterator[Table]:
     """Yield for each column that matches the first channel a table, which is a part.
 
     The channel's name may have a `*` for any text. The columns of times and of `[rows]` are in each
-    table, too, and are no parts; other columns are in none. Rows below the last cell of the part
-    that is not empty are left out. Damage of the file is damage of each part.
+    table, too, and are no parts; other columns are in none. In its table the column has the
+    channel's name, and `path` is its own name. Rows below the last cell of the part that is not
+    empty or NaN are left out. Damage of the file is damage of each part.
     """
     channel = next(iter(description.channels))
     shared = {*description.time.column, *description.rows}

@@ -81,13 +81,14 @@ def read_text(content: bytes, source: str, form: TextForm, kind_of: Kind = lambd
 def to_utf8(content: bytes, encoding: str) -> bytes:
     """Return the bytes of a text in UTF-8, with plain line feeds and without a byte order mark.
 
-    `encoding` is the encoding of `content`. Raises UnreadableError, with the line, if a byte does
-    not fit the encoding or is zero, and LookupError for an encoding that Python does not know.
+    `encoding` is the encoding of `content`. Raises UnreadableError, with the line (1 if the
+    encoding does not say where), if a byte does not fit the encoding or if the text has a zero, and
+    LookupError for an encoding that Python does not know.
     """
     is_utf8 = codecs.lookup(encoding).name == "utf-8"
     try:
         if not (is_utf8 and content.isascii()):
-            text = content.decode("utf-8-sig" if is_utf8 else encoding)
+            text = content.decode(encoding).removeprefix("\ufeff")
             content = text.encode("utf-8", "replace")
         bad = content.find(b"\0")
     except UnicodeError as error:  # some encodings do not say where

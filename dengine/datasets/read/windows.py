@@ -66,8 +66,9 @@ def _triggered(table: Table, times: Floats, description: Description, base: Path
 
     The numbers count from 1. Each part has `traces.samples` rows; those of the last may go beyond
     the table, which is no fault here. It has a fault if it begins in a gap of the times, 1.5 steps
-    of the stated rate or more. A start within the previous part is ignored. `times`, shape (rows,),
-    are in seconds and increase; `base` is not used. Raises DataError if the rate is not stated or a
+    of the stated rate or more. A start within the previous part is ignored; a trigger that is on at
+    the first row, or was off for less than its `quiet_s`, is no start. `times`, shape (rows,), are
+    in seconds and increase; `base` is not used. Raises DataError if the rate is not stated or a
     signal cannot be read, and SettingError for a malformed trigger.
     """
     rate = description.time.rate_hz
