@@ -484,7 +484,8 @@ class HttpApi:
         """Return the stored decision with this id, with its trace and label.
 
         Raises UnknownDecisionError for an unknown id, ReportError for an invalid one, StoreError if
-        it cannot be looked up, and BusyError if the queue is full or the service is closing.
+        it cannot be looked up or its trace is damaged, and BusyError if the queue is full or the
+        service is closing.
         """
         stored = await self.service.find(id_)
         if stored is None:
@@ -527,8 +528,10 @@ def _read_explanation(store: SqlStore, id_: str) -> Json:
     Beside the `Explanation` it has the decision's trace, the corrections of its label, the envelope
     (low, median, high; None without one), and the newest `N_BADS` (10) traces of bad parts among
     the newest `N_LABELS` (200) labels of cell and product, oldest first (none if their shape
-    differs). Raises what `explain` raises, such as StoreError for a damaged trace; other damaged
-    rows are left out, and an event says so.
+    is not that of the decision's trace). Raises what `explain` raises, such as StoreError for a
+    damaged trace of the decision or of a neighbour, and StoreError if one of these labels is
+    neither 0 nor 1 or their traces differ in shape. Other damaged traces are left out, and an event
+    says so.
     """
     explanation = explain(store, id_)
     trace = explanation.trace

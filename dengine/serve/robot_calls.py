@@ -302,8 +302,10 @@ class RobotCalls:
         upper and version.
 
         `request` is the caller's id of the trace, "" for a new one; `part` is the part's number, ""
-        for none. The same request id and trace get the same decision again. If the queue is full,
-        or the service or its engine is closed, that is logged, and the dict is an unrecorded VERIFY
+        for none. The same request id and trace get the same decision again. After the
+        service's deadline, or if the store fails, a new decision is VERIFY with the reason "late"
+        or "no_store", which may not be recorded (`CellService.decide`). If the queue is full, or
+        the service or its engine is closed, that is logged, and the dict is an unrecorded VERIFY
         with an id "" and the reason "busy". Raises TraceError for a trace or part that the engine
         does not take and for an id of another trace, ReportError for an invalid id, and
         SettingError for a first trace that the settings do not allow.
@@ -366,6 +368,8 @@ class RobotCalls:
         ------
         BusyError, StoreError
             If the queue is full or the service is closing, or if the store cannot be read.
+        SettingError
+            For a stored recipe that cannot be read.
         """
         service = self._service
         status = await service.status()

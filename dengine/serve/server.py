@@ -111,7 +111,9 @@ def serve(
 ) -> None:
     """Serve a cell until SIGTERM, SIGINT, or Ctrl-Break of Windows; it blocks until then.
 
-    Then the requests in the queue are answered, and the engine is closed. Logs go to stderr, a line
+    Then the requests under way have `GRACE` (5) seconds to be answered; a SIGINT after another of
+    these signals ends without waiting for them. The engine does what is in the queue, and is
+    closed. Logs go to stderr, a line
     each, also after the end (`log_lines`). In another thread than the main thread no signal ends
     it, and before it listens a signal ends the process as it does in any program.
 
@@ -155,7 +157,8 @@ def serve(
         without a token.
     Exception
         What `make`, `recorder`, or a start of one of `beside` or of OPC UA raises, such as OSError
-        for its port in use; StoreError if the second connection to the store cannot be opened.
+        for its port in use; StoreError if the second connection to the store cannot be opened, and
+        OSError if the process for retrains cannot be started.
     """
     if token_file is None and not is_loopback(host):
         raise SettingError(

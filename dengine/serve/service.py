@@ -512,8 +512,8 @@ class CellService:
         While the queue is empty, the engine does its other work (`DataEngine.poll`): it retrains if
         that is due, puts a trained version in force step by step, and calls `on_safe_mode`, a
         function that it was made with, if a safe mode began or ended. After a finished retrain each
-        of `observers` is called with its report, and every iteration over `changes` goes on. An
-        error in this work is logged and not raised.
+        of `observers` is called with its report, and every iteration over `changes`, by which
+        clients hear of changes, goes on. An error in this work is logged and not raised.
         """
         # The time right after a response is best for other work: the next part is farthest away.
         timeout = SHORT_WAIT

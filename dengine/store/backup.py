@@ -80,9 +80,12 @@ def backup_store(url: FilePath, out: FilePath) -> BackupReport:
         was begun with another key than the one in the file that DENGINE_LEDGER_KEY names, if that
         file cannot be read, or if the records cannot be written to the copy.
     OutputError
-        If `out` exists, or cannot be written, for example on a full disk. Also if SQLite finds
+        If `out` exists, or the `-wal` file of an earlier store beside it, or if `out` cannot be
+        written, for example on a full disk. Also if SQLite finds
         damage in the store while it copies it or counts the rows of the copy.
     """
+    log_file = f"{os.fspath(out)}-wal"  # SQLite would take its rows for the copy's
+    expect(not Path(log_file).exists(), f"no {log_file}", "one", "move it away", OutputError)
     with reading(os.fspath(url)) as connection:
         dialect = connection.dialect.name
         expect(
@@ -132,7 +135,7 @@ def restore_store(copy: FilePath, store: FilePath) -> tuple[CellHistory, ...]:
         What `backup_store` wrote. It is checked in full, and its rows are only read, but the file
         is set to WAL mode if it can be written.
     store : str or path
-        A file that does not exist yet.
+        A file that does not exist yet, nor its `-wal` file.
 
     Returns
     -------
@@ -147,7 +150,7 @@ def restore_store(copy: FilePath, store: FilePath) -> tuple[CellHistory, ...]:
         and that nobody has acknowledged, and for the other reasons of `verify_history` and
         `backup_store`. If a journal cannot be made: the store has been copied by then, and stays.
     OutputError
-        If `store` exists, or cannot be written, for example on a full disk.
+        If `store` or its `-wal` file exists, or it cannot be written, for example on a full disk.
     """
     report = verify_history(os.fspath(copy))
     if not report.ok:

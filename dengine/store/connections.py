@@ -392,7 +392,8 @@ class Database:
 
         StoreError is raised, too, if the function given to `commit_if` returns False, and if the
         SQLite file was replaced. If this is noticed only after the commit, the rows are in the
-        file that was replaced.
+        file that was replaced. The lock keeps other transactions from writing rows of the cell
+        until this one ends; SQLite locks the whole file.
         """
         with _store_errors("write to", self.name), self._writer.connect() as connection:
             connection.execution_options(dengine_write=True)
@@ -489,7 +490,8 @@ class Database:
         """Run SQLite's integrity check on the tables that engines read, all but traces and events.
 
         Return its first finding, or the text of the error if the check fails, which also happens
-        after `close`; "" if all is well. PostgreSQL and a store in memory are not checked: "".
+        after `close`; "" if all is well. PostgreSQL and a store in memory are not checked: "". The
+        records that wait in the outbox are written first, if the database takes them in time.
         """
         for name in CHECKED_TABLES if self._file is not None else ():
             try:

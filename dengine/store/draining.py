@@ -300,12 +300,14 @@ class Drainer:
     def _drain_chunk(self) -> None:
         """Commit the oldest records that are on the journal's disk, at most CHUNK (500).
 
-        There must be one. A decision is left out if a later record with the same id replaces it.
-        The records are committed as they are in memory; that some of them are damaged on disk, or
-        cannot be read there, is noted by an event, which is also logged. Then the journal's header
-        notes that the database has the records, `n_drained` counts them, and they leave the queue
-        of the recorder and, except for the newest decisions, the `DecisionIndex`, by which
-        decisions are found in memory. In a product the numbers of their labels are kept for
+        There must be one. A decision is left out if a later record with the same id replaces it. A
+        record that contradicts the store, or that the database refuses, becomes a dead letter
+        (`SqlStore.apply_records`) and counts as drained. The records are committed as they are in
+        memory; that some of them are damaged on disk, or cannot be read there, is noted by an
+        event, which is also logged. Then the journal's header notes that the database has the
+        records (if it cannot be written, that is ignored), `n_drained` counts them, and they leave
+        the queue of the recorder and, except for the newest decisions, the `DecisionIndex`, by
+        which decisions are found in memory. In a product the numbers of their labels are kept for
         `pop_label_numbers`. Raise StoreError if the database fails; nothing of this is done then,
         and the next call commits the same records again, of which some may be stored already.
         """

@@ -269,8 +269,9 @@ class Journal:
         """Yield (offset, end, encoded record) of the records that the store lacks, oldest first.
 
         A record takes the bytes of the file from `offset` to before `end`. Damaged records are
-        skipped: the search goes on at the next mark of a record. Raise OSError, and no StoreError,
-        if the disk cannot be read.
+        skipped: the search goes on at the next mark (`MARK`, four bytes with which each record
+        begins), and the digest that chains a record to the one before is not checked. Raise
+        OSError, and no StoreError, if the disk cannot be read.
         """
         begin = self.drained_to
         while begin < self.end:
@@ -537,8 +538,8 @@ def journal_path(url: Any, cell_id: str) -> Path:
     url : sqlalchemy.URL
         The store.
     cell_id : str
-        Characters that a file name cannot have are escaped, and also capital letters if the
-        system's file names ignore case.
+        Each character but ASCII letters, digits and `_.-~` is escaped, as in a URL (a blank is
+        %20), and also capital letters if the system's file names ignore case.
 
     Returns
     -------

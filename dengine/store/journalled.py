@@ -289,8 +289,9 @@ class JournalledStore(Outbox):
         """Return the decision that an id already has, or None for a new id.
 
         The decision has its label if the label is on disk. Raise StoreError if the id cannot be
-        looked up. From then on `find_decision` raises StoreError for this id too, until a decision
-        is recorded for it or this method has looked it up.
+        looked up in time, or its stored trace is damaged. After such an error `find_decision`
+        raises StoreError for this id too, until a decision is recorded for it or this method is
+        called again without an error.
         """
         with self._changed:
             self._unrecorded.discard(decision_id)

@@ -73,8 +73,9 @@ class LabelTable(CellTable):
 
         Labels that a person had forgotten are left out, and so are labels of quarantined traces,
         which are stored but never used in training. A trace that is missing or not as it was stored
-        is left out, too, and an event with the ids of such decisions is written to the store, or
-        logged if the store cannot be written.
+        is left out, too, and an event with the ids of such decisions (of eight at most, and the
+        number of the others) is written to the store, unless it has this event already, or logged
+        if the store cannot be written.
 
         Parameters
         ----------

@@ -254,7 +254,7 @@ def parse_object(text: Any) -> dict[str, Any]:
 
     `text` is as the driver returned it, so it may be anything. Nothing is raised.
     """
-    with suppress(ValueError, TypeError):
+    with suppress(ValueError, TypeError, RecursionError):
         fields = json.loads(text)
         if isinstance(fields, dict):
             return fields

@@ -258,7 +258,8 @@ def propose_lengths(p: Proposal) -> None:
     The length is that of the first channel. Recordings without rows are ignored, and without a
     channel it is 0. If some have another length, and `traces.lengths` is not stated, a note counts
     them; if they are more than 10 %, `traces.lengths` becomes `pad`. A stated `traces.samples`
-    stays.
+    stays. Another note counts the recordings that end with several zeros, if they are more than
+    10 % and the numbers of zeros differ: these may fill up shorter ones.
     """
     first = [p.columns[name] for name in p.description.channels][:1]
     lengths = [len(words) for column in first for words in column.words if len(words)]
@@ -270,7 +271,13 @@ def propose_lengths(p: Proposal) -> None:
             f"{max(others)}; other choices: cut, pad-all, resample, strict"
         )
         p.put("traces.lengths", "pad" if len(others) > SPARSE * len(lengths) else "strict", text)
-    p.put("traces.samples", usual)
+    zeros = [len(x) - len(np.trim_zeros(x, "b")) for column in first for x in column.numbers]
+    filled = [n for n in zeros if n > 1]
+    is_filled = len({*filled}) > 1 and len(filled) > SPARSE * len(zeros)
+    text = (
+        f"{len(filled)} recordings end with 2 to {max(filled, default=0)} zeros: are these samples?"
+    )
+    p.put("traces.samples", usual, text if is_filled else "")
 
 
 def list_others(p: Proposal) -> None:

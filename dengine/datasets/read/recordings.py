@@ -283,10 +283,9 @@ def is_dropped(part: Table, rows: Mapping[str, RowWords]) -> bool:
 
     So has a row of a wide table with the samples of another signal.
     """
-    cells = {name: part.columns.get(name, ()) for name in rows}
-    return any(
-        len(c) == 1 and rows[name].kind(as_word(c[0])) == "drop" for name, c in cells.items()
-    )
+    cells = {name: part.columns[name] for name in rows if name in part.columns}
+    words = {name: as_word(cell[0]) for name, cell in cells.items() if len(cell) == 1}
+    return any(rows[name].kind(word) == "drop" for name, word in words.items())
 
 
 def dataset_of(recordings: Sequence[Recording], description: Description) -> Dataset:
