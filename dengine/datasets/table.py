@@ -226,14 +226,15 @@ def pattern_of(decimal: str, thousands: str) -> re.Pattern[str]:
 def _number(cell: Any, form: TextForm, pattern: re.Pattern[str]) -> float:
     """Return the number in a cell; NaN for a word of `form.missing`, infinity for any other text.
 
-    A float is returned as it is; None is read as an empty cell. A text that is a number counts as
-    one even if it is in `form.missing`; one too large for float64 is infinity. `form` has the
-    decimal mark and the mark of thousands, and `pattern` is the regular expression of a number with
-    these.
+    A float is returned as it is; None is read as an empty cell. A number too large for float64 is
+    infinity. `form` has the decimal mark and the mark of thousands, and `pattern` is the regular
+    expression of a number with these.
     """
     if isinstance(cell, float):
         return cell
     text = "" if cell is None else str(cell).strip()
+    if text in form.missing:
+        return np.nan
     if not pattern.fullmatch(text):
-        return np.nan if text in form.missing else np.inf
+        return np.inf
     return float(text.replace(form.thousands, "").replace(form.decimal, ".").replace(MINUS, "-"))

@@ -9,19 +9,21 @@ from ...errors import listed
 from ...records import Floats
 from ..checks import check_clock
 from ..dataset import LEAST_RATE_HZ, MOST_RATE_HZ, Fault
-from ..description import UNKNOWN
+from ..description import ANY, UNKNOWN
 from ..read.clock import UNITS, check_steps, has_day, scale_of, times_of
 from ..read.files import caught
 from ..table import Table, UnreadableError
 from ..units import quantity_of
-from .columns import Column, Proposal, Tables
+from .columns import FORCES, Column, Proposal, Tables
 
 NAME = re.compile(
     r"time|zeit|stamp|clock|temps|tiempo|tempo|hora|heure|millis|milli?tm|micros|elapsed|epoch"
-    r"|(^|\.)(t|ms|us|ns|sec|secs|seconds|date|datum|uhr|x_value|ticks)$|^t[ _/\[(]"
+    r"|(^|\.)(t|ms|us|ns|sec|secs|seconds|date|datum|uhr|x_value)$|^t[ _/\[(]|tick_?count"
+    r"|(^|[._ ])(tm|[mun]sec|tick|(\w+_)?ts)s?($|[._ ])|[\[(][mun\u00b5]?s(ec)?[\])]"
     r"|tijd|czas|时间|時間|時刻|시간",
     re.IGNORECASE,
 )
+COUNTER_NAME = re.compile(r"(?i)(index|row|sample|n|i|punkt|point|count|nr|no|line)s?")
 UNIT_IN_NAME = re.compile(
     r"(?:[\[(/_ ]|in )\s*((?:[\d.,]+ ?)?(?:s|ms|us|µs|ns|min|h|[mun]?sec))\s*[\])]?$"
 )
@@ -34,6 +36,7 @@ NAMED_UNIT = re.compile(
 EPOCHS = (
     *((unit, 0) for unit in ("s", "ms", "us", "ns")),
     ("d", 2_209_161_600),  # since 1900, as spreadsheets count days
+    ("d", 62_167_305_600),  # since the year 0, as MATLAB counts them
     ("0.0864 s", 2_209_161_600),  # 1e-6 days since 1900, as WinCC counts them
     ("0.1 us", 11_644_473_600),  # since 1601
     ("0.1 us", 62_135_596_800),  # since the year 1
@@ -42,6 +45,7 @@ YEARS = (946_684_800, 2_524_608_000)  # seconds since 1970 of the years 2000 to 
 # Steps between these are taken for seconds: larger ones may be milliseconds of a rate up to 50 kHz,
 # and smaller ones minutes.
 SECONDS = (2e-4, 0.019)
+EVEN = 0.01  # by which equal steps may differ, as a share of them
 FEW = 0.1  # of the recordings that may have a gap, and of the steps that may fall
 ANSWERS = (  # to a clock that the reader would refuse
     "state the longest time.gap (0: any; with traces.lengths=resample if the clock jitters), or "
@@ -68,7 +72,7 @@ def propose_clock(p: Proposal) -> None:
     names = [c.name for c in p.columns.values() if c in clocks or (c in coarse and not has_days)]
     if not clocks:
         has_no_names = "c0" in p.description.text.names or "s" in p.columns  # may be the stroke
-        names = [*p.columns] if has_no_names else []
+        names = [*p.columns] if has_no_names else [c.name for c in p.unused if is_counter(c)]
     if clocks and (is_stated or len(names) == 1):
         p.put("time.column", [column.name for column in clocks])
         p.put("time.format", [form_of(column, p, len(clocks) == 1) for column in clocks])
@@ -95,15 +99,48 @@ def is_clock(column: Column) -> bool:
     return bool(abs(falls - 0.5) >= 0.5 - FEW)
 
 
+def is_counter(column: Column) -> bool:
+    """Return whether numbers may count the samples, or tell the time, under a name of no clock.
+
+    They have equal steps, but not of 0 or 1; or unequal ones, in a column that is named like a
+    counter (`index`, `sample`, `n`, ...). A column like `x*`, the samples of a wide table, is none,
+    nor is one that is named like a force or has a unit of another quantity.
+    """
+    steps = column.steps
+    usual = float(np.median(steps)) if len(steps) else 0.0
+    is_even = bool((np.abs(steps - usual) <= EVEN * abs(usual)).all())
+    if COUNTER_NAME.fullmatch(column.name):
+        return not is_even
+    is_channel = quantity_of(column.unit) or any(name.search(column.name) for name in FORCES[:2])
+    return is_even and usual not in (0, 1) and not is_channel and ANY not in column.name
+
+
+def epoch_of(column: Column) -> str:
+    """Return the unit in which a column of times counts from a known day; "" if it does not.
+
+    With it the first number is a time in the years 2000 to 2050, counted from 1970 or from another
+    day that clocks use, and the median of the steps is of a rate of 1 Hz to 1 MHz. The first in
+    `EPOCHS` counts.
+    """
+    steps = np.abs(column.steps[column.steps != 0])  # falling, if the newest row is the first
+    for unit, zero in EPOCHS if len(steps) else ():
+        scale = scale_of(unit)
+        moment = float(np.concatenate(column.numbers)[0]) * scale - zero
+        if YEARS[0] <= moment <= YEARS[1] and is_rate(float(np.median(steps)) * scale):
+            return unit
+    return ""
+
+
 def form_of(column: Column, p: Proposal, is_alone: bool) -> str:
     """Return the unit or the form of a column of times; `?` if none is certain.
 
-    The form of dates or times of day comes first, then the unit that the file states, the one in
-    the column's name, like `ms` of `t [ms]`, `t in 0.1 ms` or `millis`, and what the size of the
-    numbers proves. A note on `time.format` in `p` says why it is `?`, or that only the size of the
-    numbers says s. If several forms of dates fit, so that day and month can be confused, the form
-    is `?`; but if another column tells a part of the time, too, and all recordings have one and the
-    same date, it is the first of these forms.
+    The form of dates or times of day comes first, then the unit that dates of today prove
+    (`epoch_of`), the unit that the file states, the one in the column's name, like `ms` of `t
+    [ms]`, `t in 0.1 ms` or `millis`, and what the size of the numbers proves. A note on
+    `time.format` in `p` says why it is `?`, or that only the size of the numbers says s. If several
+    forms of dates fit, so that day and month can be confused, the form is `?`; but if another
+    column tells a part of the time, too, and all recordings have one and the same date, it is the
+    first of these forms.
 
     is_alone : whether no other column tells a part of the time.
     """
@@ -111,7 +148,7 @@ def form_of(column: Column, p: Proposal, is_alone: bool) -> str:
     if len(forms) > 1 and (is_alone or len({*column.fixed}) != 1):
         p.notes["time.format"] = f"{listed(forms)}: the cells prove neither"
         return UNKNOWN
-    units = [*forms, column.unit]
+    units = [*forms, epoch_of(column), column.unit]
     if match := UNIT_IN_NAME.search(column.name):
         units.append(match[1].replace(",", "."))
     elif match := NAMED_UNIT.search(column.name):
@@ -124,14 +161,11 @@ def form_of(column: Column, p: Proposal, is_alone: bool) -> str:
 
 
 def _unit_by_size(column: Column, p: Proposal) -> str:
-    """Return the unit of time that the numbers in a column prove; `?`, with a note, if none.
+    """Return the unit of time that the steps in a column prove; `?`, with a note, if none.
 
-    A unit is proved if with it the first number is a time in the years 2000 to 2050, counted from
-    1970 or from another day that clocks use, and the median of the steps above 0 gives a rate of
-    1 Hz to 1 MHz; the first in `EPOCHS` counts. If none is, and this step is 0.0002 to 0.019, the
-    unit is s, and a note on `time.format` in `p` says so. Otherwise it is `?`, and the note lists
-    the possible units. It is `?`, too, if the column has no numbers that rise; the note then asks
-    for the form of its cells.
+    If the median of the steps is 0.0002 to 0.019, the unit is s, and a note on `time.format` in `p`
+    says so. Otherwise it is `?`, and the note lists the possible units. It is `?`, too, if the
+    column has no numbers that rise; the note then asks for the form of its cells.
     """
     rising = np.abs(column.steps[column.steps != 0])  # or falling, with the newest row first
     if not len(rising):
@@ -140,12 +174,7 @@ def _unit_by_size(column: Column, p: Proposal) -> str:
             f"no form of times that is known fits {odd}: state it, or text.drop"
         )
         return UNKNOWN
-    first = float(np.concatenate(column.numbers)[0])
     step = float(np.median(rising))
-    for unit, zero in EPOCHS:
-        scale = scale_of(unit)
-        if YEARS[0] <= first * scale - zero <= YEARS[1] and is_rate(step * scale):
-            return unit
     if SECONDS[0] <= step <= SECONDS[1]:
         p.notes["time.format"] = f"seconds, for steps of {step:.6g}; the unit is not stated"
         return "s"

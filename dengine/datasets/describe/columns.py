@@ -36,6 +36,12 @@ MOST_CELLS = 20  # of a recording whose form of times is looked at
 NUMBER = re.compile(
     r"\s*[-+−]?(?=[.,]?\d)(\d{1,3}([ '’\u202f\xa0.,]\d{3})+|\d*)([.,]\d*)?([eE][-+]?\d+)?\s*"
 )
+# Names of channels, the likeliest first.
+FORCES = (
+    re.compile(r"(?i)(^|[^a-z])f_?z(?![a-z])|(force|kraft|wrench)[^a-z]*z|force_2$"),
+    re.compile(r"(?i)force|kraft|fuerza|forza|load|torque|drehmoment|thrust|effort|last\b|力|荷重"),
+    re.compile(r"(?i)^(.*\.)?_?(f\b.*|value)$"),
+)
 Stated = Mapping[str, Any]
 Tables = Sequence[Table]
 

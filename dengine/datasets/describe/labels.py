@@ -37,15 +37,17 @@ VERDICT = (
 )
 WHOLE = "(total|overall|final|part|teil|gesamt)"
 NAME = re.compile(rf"(?i)(({WHOLE}|test|{VERDICT})[-_ ./]?)?{VERDICT}([-_ .]?{WHOLE})?")
-GOOD_NAME = re.compile(r"(?i)(.*[./])?(y|success|ok|io|pass(ed)?|accept(ed)?|good)")
+GOOD_NAME = re.compile(r"(?i)(.*[./])?(success|ok|io|pass(ed)?|accept(ed)?|good)")
 IN_PATHS = (*GOOD, *BAD, "pending", "offen", "unchecked")
 WORD = "|".join(sorted(map(re.escape, IN_PATHS), key=len, reverse=True))
 NEGATED = re.compile(  # or of a name that may be bad, as in `leak=False`
-    rf"(?i)(not.(?!ok)|nicht.|(?-i:[-_ .]n)[-_ .](?!i))({WORD})"
+    rf"(?i)(not.(?!ok)|(?<![a-z])(nicht|non|kein|pas|hors)([-_ .][^-_ ./]+)?[-_ .]|nicht."
+    rf"|(?-i:[-_ .]n)[-_ .](?!i))({WORD})"
     r"|[a-z][-_ .=(/]+(true|false)(?![a-z])"
 )
 PATHS = (  # of verdicts in folders, and at the end or beginning of names
     rf"(?:^|/)({WORD})/",
+    rf"[-_ ]({WORD})/",
     rf"(?:^|[-_ ./(=+\[])({WORD})[-_ \d()\]]*$",
     rf"(?:^|/)({WORD})(?=[-_ ][^/]*$)",
 )
@@ -69,13 +71,12 @@ def with_meanings(source: LabelSource, words: Names) -> LabelSource:
     """Return a source of labels in which `words` are sorted into `good`, `bad` and `unchecked`.
 
     A list that the source has already stays; the others get the words of known meaning, like "ok",
-    in any case of letters. If a word stays without a meaning, `good` and `bad` become `?` if they
-    would be empty. The same holds for a path if either is empty: `pass_1.csv` alone proves nothing.
-    True, yes or 1 and their opposites, alone or with words for unchecked, have known meanings only
-    if the name of the column, line or topic is one for good, like `success`, not `failed`; in a
-    path that takes any word they have none. Beside other words, and in a path whose expression
-    lists its words, true means good and false bad, whatever the name is; yes, 1 and their opposites
-    have no known meaning there.
+    in any case of letters. Then `good` or `bad` becomes `?` if it would be empty: that all files
+    say `OK` alone proves nothing. True, yes or 1 and their opposites, alone or with words for
+    unchecked, have known meanings only if the name of the column, line or topic is one for good,
+    like `success`, not `failed`; in a path that takes any word they have none. Beside other words,
+    and in a path whose expression lists its words, true means good and false bad, whatever the name
+    is; yes, 1 and their opposites have no known meaning there.
     """
     words = sorted({*words})
     name = source.column or source.line or source.topic or ("([^" in source.path and source.path)
@@ -86,7 +87,7 @@ def with_meanings(source: LabelSource, words: Names) -> LabelSource:
         key: getattr(source, key) or tuple(word for word in words if word.lower() in group)
         for key, group in zip(("good", "bad", "unchecked"), (*verdicts, UNCHECKED), strict=True)
     }
-    is_one_sided = source.path and not (about["good"] and about["bad"])
+    is_one_sided = not (about["good"] and about["bad"])
     if is_one_sided or {*words}.difference(*about.values()):
         about |= {key: about[key] or (UNKNOWN,) for key in ("good", "bad")}
     return replace(source, **about)
@@ -147,7 +148,8 @@ def lines_of(p: Proposal) -> list[str]:
     Only the first of `p.tables` is looked at. Comment marks and quotes before it are left out. Each
     beginning comes once; empty ones are left out.
     """
-    lines = [re.split(r"[;:=\t,]|  ", line.lstrip("#%* \t\"'"))[0] for line in p.tables[0].above]
+    above = [line.lstrip("#%* \t\"'") for table in p.tables[:1] for line in table.above]
+    lines = [re.split(r"[;:：=\t,]|  ", line)[0] for line in above]
     return [*filter(None, dict.fromkeys(line.strip(" \"'") for line in lines))]
 
 

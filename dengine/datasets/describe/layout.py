@@ -9,17 +9,17 @@ import numpy as np
 
 from ...errors import DataError, listed
 from ..description import ANY, UNKNOWN, Channel, TextForm
-from ..read.split import OBJECTS, split
+from ..read.split import OBJECTS, has_lists, split
 from ..table import Table
 from . import labels
 from .clock import NAME as CLOCK_NAME
 from .columns import LEAST_RUN, Column, Proposal, Tables, columns_of
 
 PART_NAME = re.compile(
-    r"(?i)part|serial|episode|teil|werkst(?!.*tr(ä|ae?)ger)|barcode|dmc|trial|piece|sample_?id"
+    r"(?i)part|serial|episode|teil(?!schritt)|werkst(?!.*tr(ä|ae?)ger)|barcode|dmc|trial|piece|sample_?id"
     r"|^(id|run|sn|cycle|shot|nr|no)$|(?<!order)(?<!batch)(?<!shift)(?<!lot)_(id|run|cycle|sn|nr)$"
 )
-NUMBER = re.compile(r"\d+(\.\d+)?(?=[\])]?( ?[\[(][^\d\[(]+[\])])?$)")  # as in `F_0.5 [N]`
+NUMBER = re.compile(r"\d+(\.\d+)?(e-?\d+)?(?=[\])]?( ?[\[(][^\d\[(]+[\])])?$)")  # as in `F_0.5 [N]`
 LEAST_NUMBERED = 20  # columns with numbers behind one name that are the samples of a part
 MOST_PARTS = 240
 
@@ -107,12 +107,6 @@ def numbered_columns(table: Table) -> list[str]:
     """
     counts = Counter(NUMBER.sub(ANY, name) for name in table.columns)
     return [pattern for pattern, n in counts.items() if n >= LEAST_NUMBERED]
-
-
-def has_lists(table: Table) -> bool:
-    """Return whether the first cell of any column is a list or array of two items or more."""
-    cells = [column[0] for column in table.columns.values() if len(column)]
-    return any(isinstance(cell, list | np.ndarray) and len(cell) > 1 for cell in cells)
 
 
 def _refuse_results(columns: Iterable[Column]) -> None:

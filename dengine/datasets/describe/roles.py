@@ -3,7 +3,7 @@ nothing.
 """
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import replace
 
@@ -15,26 +15,27 @@ from ..read.files import natural_key
 from ..read.recordings import is_dropped, kept_rows
 from ..read.split import match_numbered
 from ..units import quantity_of
+from .clock import COUNTER_NAME, is_clock, propose_clock, propose_rate
 from .clock import NAME as CLOCK_NAME
-from .clock import is_clock, propose_clock, propose_rate
-from .columns import MOST_WORDS, Column, Proposal, columns_of, counts_of
+from .columns import FORCES, MOST_WORDS, Column, Proposal, columns_of, counts_of
 from .labels import NAME, has_meaning, lines_of, part_words, propose_label
 from .layout import PART_NAME
 from .order import propose_order
 
 SPARSE = 0.1
 STRANGE = 0.01
-PART_LINE = re.compile(r"(?i)serial|barcode|dmc|part ?(no|num|id)|teilenummer|werkst.ck|serien")
-QUALIFIER_NAME = re.compile(r"(?i)status|valid|quality|flag|error|state")
-SIGNAL = re.compile(r"(?i)(force|kraft|torque|drehmoment|load|last)([_ ]?[xyz])?")
-COUNTER_NAME = re.compile(r"(?i)(index|row|sample|n|i|punkt|point|count|nr|no|line)s?")
-LOADS = ("force", "torque")
-SET_VALUE = re.compile(r"(?i)(^|[^a-z])(set|soll|max|min|limit)")
-FORCES = (
-    re.compile(r"(?i)(^|[^a-z])f_?z(?![a-z])|(force|kraft|wrench)[^a-z]*z|force_2$"),
-    re.compile(r"(?i)force|kraft|fuerza|forza|load|torque|drehmoment|thrust|effort|last\b|力|荷重"),
-    re.compile(r"(?i)^(.*\.)?_?(f\b.*|value)$"),
+PART_LINE = re.compile(
+    r"(?i)serial|(?<!fixture )barcode|dmc|part ?(no|num|id)|teilenummer|werkst.ck(?!tr)|serien"
 )
+QUALIFIER_NAME = re.compile(
+    r"(?i)status|valid|g(ü|ue)ltig|qualit|flag|error|fehler|fault|d[ée]faut|state|overload|(ü|ue)berl"
+    r"|stale|lost|missing|satur|good|[ _.](ok|io)$|^qc?$"
+)
+SIGNAL = re.compile(r"(?i)(force|kraft|torque|drehmoment|load|last)([_ ]?[xyz])?")
+LOADS = ("force", "torque")
+SENTINEL = re.compile(r"(?i)-?9{4,}([.,]0+)?|-999[.,]25|-?1([.,]0+)?e\+?3\d|3[.,]4028\d*e\+?38")
+SCALE_NAME = re.compile(r"(?i)(^|[^a-z])(unit|einheit|scale|factor|faktor|.*rate)s?($|[^a-z])")
+SET_VALUE = re.compile(r"(?i)(^|[^a-z])(set|soll|vorgabe|nominal|target|consigne|max|min|limit)")
 
 
 def propose_roles(p: Proposal) -> None:
@@ -126,13 +127,13 @@ def qualify_rows(p: Proposal) -> None:
 def qualifies(column: Column, n_rows: int) -> bool:
     """Return whether the words of a column may tell which rows are samples.
 
-    It must have at most 12 different words, and a cell in each of the `n_rows` rows of all
-    recordings, or one for each recording. The words must change within a recording, or one of
-    several must name a force or a torque. A column that is named like a status (`Status`, `valid`)
-    may have numbers, and also just one word in all. Any other must have texts, or empty cells if it
-    is named like a verdict, and no name like a clock. A column that is named like a verdict and has
-    one word in each recording, of which any is known to mean good or bad, holds labels instead, and
-    gives False.
+    It must have a cell in each of the `n_rows` rows of all recordings, or one for each recording,
+    and at most 12 different words, unless it is named like a status and has texts. The words must
+    change within a recording, or one of several must name a force or a torque. A column that is
+    named like a status (`Status`, `valid`) may have numbers, and also just one word in all. Any
+    other must have texts, or empty cells if it is named like a verdict, and no name like a clock. A
+    column that is named like a verdict and has one word in each recording, of which any is known to
+    mean good or bad, holds labels instead, and gives False.
     """
     name = column.name
     words = column.counts
@@ -142,8 +143,11 @@ def qualifies(column: Column, n_rows: int) -> bool:
     is_text = has_words and not CLOCK_NAME.search(name)
     is_signal = len(words) > 1 and any(SIGNAL.fullmatch(word) for word in words)
     varies = not column.fixed or is_signal or (is_named and len(words) == 1)
+    is_coded = is_named and any(column.odd)
     is_full = words.total() in (n_rows, len(column.fixed))  # a cell for each row, or recording
-    if not (is_named or is_text) or not varies or not is_full or len(words) > MOST_WORDS:
+    if not (is_named or is_text) or not varies or not is_full:
+        return False
+    if len(words) > MOST_WORDS and not is_coded:
         return False
     return not (is_verdict and column.fixed and has_meaning(LabelSource(column=name), words))
 
@@ -181,7 +185,9 @@ def propose_channels(p: Proposal, units: Mapping[str, str]) -> None:
     likely = [name for name, unit in units.items() if not unit or name in forces]
     named = [[*filter(pattern.search, likely)] for pattern in FORCES]
     best = next(filter(None, (*named[:2], forces, named[2], [*units])), [])
-    doubts = [*filter(None, (_doubt_on(p, name) for name in best))]
+    if forces and not {*best} & {*forces}:
+        best = [*best, *forces]  # one has the name, another the unit
+    doubts = [*filter(None, (*(_doubt_on(p, name) for name in best), *_other_scales(p)))]
     if len(best) == 1 and not doubts:
         p.put("channels", {best[0]: units[best[0]]})
         return
@@ -206,6 +212,21 @@ def _doubt_on(p: Proposal, name: str) -> str:
     return f"{name} is not numbered evenly at {columns[odd[0] + 1][0]}" if len(odd) else ""
 
 
+def _other_scales(p: Proposal) -> Iterator[str]:
+    """Yield a text for each column or line above the header by which scales of recordings differ.
+
+    It is named like a unit, a factor or a rate, and has one word in each recording, but not the
+    same in all. Raises SettingError for a malformed `windows.trigger`.
+    """
+    sources = [PartSource((column.name,)) for column in p.unused]
+    sources += [PartSource(line=line) for line in lines_of(p)]
+    for source in sources:
+        name = " ".join(source.column) or source.line
+        counts = counts_of(part_words(source, p.tables).values())
+        if SCALE_NAME.search(name) and "," in counts:
+            yield f"{name} differs, {counts}: convert them first, or state channels"
+
+
 def _units(p: Proposal) -> dict[str, str]:
     """Return the columns that may be channels, with their units; "" for no unit.
 
@@ -228,13 +249,22 @@ def find_lost(p: Proposal) -> None:
     """Set `text.missing` in `p` to the words that stand for lost samples (cells without a value).
 
     They are those already there, and those of `LOST`, also the empty cell, that a channel has, in
-    any case of letters. If another text is in more than 1 % of a channel's cells, `text.missing` is
-    `?`, with a note. If more than 10 % of the cells of a channel are empty, "" is not added for it
-    if `time.column` is set, even to `?`: these rows belong to another signal. `[rows]` then drops
-    them, unless it has words of this channel already; dropped rows are left out of `p.tables` and
+    any case of letters. If another text is in more than 1 % of a channel's cells, or, in a text
+    file, a number like -9999 or 1e30 in any, `text.missing` is `?`, with a note. If more than 10 %
+    of the cells of a channel are empty, "" is not added for it if `time.column` is set, even to
+    `?`: these rows belong to another signal. `[rows]` then drops them, unless it has words of this
+    channel already; its `keep` is `?` for an ignored column of numbers in which up to 10 % of the
+    cells are other words, like `Max` in a footer. Dropped rows are left out of `p.tables` and
     `p.columns`. A stated `text.missing` stays, but `[rows]` changes all the same.
     """
     rows = dict(p.description.rows)
+    for column in p.unused:
+        if column.strange and column.odd.total() <= SPARSE * column.counts.total():
+            rows[column.name] = RowWords((UNKNOWN,))
+            text = (
+                f"which rows are samples? Of numbers, and {counts_of(column.strange)}: state drop"
+            )
+            p.notes[f"rows.{column.name}.keep"] = text
     missing = {*p.description.text.missing}
     strange = dict[str, int]()
     for name in p.description.channels:
@@ -246,6 +276,8 @@ def find_lost(p: Proposal) -> None:
             rows.setdefault(name, RowWords((ANY,), ("",)))
         missing |= lost
         strange |= {word: k for word, k in column.strange.items() if k > STRANGE * n}
+        if p.description.format == "text":
+            strange |= {word: k for word, k in column.counts.items() if SENTINEL.fullmatch(word)}
     set_rows(p, rows)
     p.put("text.missing", sorted(missing))
     if strange:

@@ -33,6 +33,7 @@ LATIN = "cp1252"
 MOST_LINES = 200  # by which the delimiter and the first row of samples are found
 MOST_NAMES = 20  # columns without a header that get a name each
 MOST_CLASSES = 12  # whole numbers in the first column of a matrix that are its classes
+DIGITS = re.compile(r"\d+")
 WHOLE = re.compile(r"-?\d+(\.0*)?(e\+00)?")
 UNIT_WORDS = re.compile(
     r"(?i)[\[(]?(hh:mm(:ss)?|dd\.mm\.yyyy|[\d.]+ ?[mu]?s|[mun]?s(ecs?)?|min|h)[\])]?"
@@ -186,8 +187,9 @@ def propose_form(p: Proposal, contents: Mapping[str, bytes], faults: list[Fault]
     """Set `[text]` in `p` to the text form of most files; return the names of these files.
 
     Files with another delimiter, number of columns or header are left out: they move from `p.names`
-    to `p.others`. If two or more of them have at least 8 rows of samples, `exclude` is set to `?`,
-    with a note that asks whether they are recordings. For a file that is no text, or whose header
+    to `p.others`. If two or more of them have at least 8 rows of samples, or one whose name differs
+    from that of another file by a number only, `exclude` is set to `?`, with a note that asks
+    whether they are recordings. For a file that is no text, or whose header
     is not certain, a fault is appended to `faults`, and it stays in `p.names`; if all are such,
     nothing is set and returned. Of equally frequent forms the first counts. Stated keys stay.
 
@@ -203,7 +205,9 @@ def propose_form(p: Proposal, contents: Mapping[str, bytes], faults: list[Fault]
     odd = [name for name, form in forms.items() if form != usual]
     p.others = [*p.others, *odd]
     p.names = [name for name in p.names if name not in odd]
-    if sum(len(looks[name].rows) >= LEAST_RUN for name in odd) > 1:
+    long = [name for name in odd if len(looks[name].rows) >= LEAST_RUN]
+    alike = {DIGITS.sub("0", name) for name in long} & {DIGITS.sub("0", name) for name in same}
+    if len(long) > 1 or alike:
         p.put("exclude", UNKNOWN, f"are {listed(odd)} recordings of another form? See files")
     if same:
         _propose_keys(p, [looks[name] for name in same])
@@ -268,9 +272,9 @@ def propose_marks(p: Proposal, cells: Collection[str]) -> None:
     `1.043,5` can only be read with a decimal comma. The decimal mark is `?`, with a note, if point
     and comma read as many numbers, or if more than 5 % of the numbers cannot be read at all; but
     not if no number has a point or comma. The mark of thousands is `?`, with a note, if it is a
-    point or comma, fewer than 5 % of the numbers need it, and no number has both a point and a
-    comma: `7,286` among `7.1` and `8.2` may be a damaged number. It is "" if no mark reads more
-    numbers. If the decimal mark is stated, only this one is tried. Stated keys stay.
+    point or comma, and no number has both a point and a comma: `7,286` may be a fraction. It is ""
+    if no mark reads more numbers. If the decimal mark is stated, only this one is tried. Stated
+    keys stay.
 
     cells : the different texts in the samples that are numbers with any of these marks.
     """
@@ -285,8 +289,8 @@ def propose_marks(p: Proposal, cells: Collection[str]) -> None:
     p.put("text.decimal", marks[0])
     p.put("text.thousands", groups[0])
     is_both = any({*".,"} <= {*cell} for cell in cells)
-    n_needed = most - n_read[marks[0], ""]
-    if groups[0] in (".", ",") and not is_both and n_needed < (1 - LIKELY) * len(cells):
+    if groups[0] in (".", ",") and not is_both:
+        n_needed = most - n_read[marks[0], ""]
         p.put("text.thousands", UNKNOWN, f"'.' or ',', or '' if there is none: {n_needed} need it")
     marked = [cell for cell in cells if {*cell}.intersection(".,")]
     if marked and (len({*marks}) > 1 or most < LIKELY * len(cells)):

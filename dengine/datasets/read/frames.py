@@ -91,6 +91,9 @@ def columns_of(prefix: str, value: Any) -> Columns:
 def _turned(value: Any) -> Mapping[Any, Any] | None:
     """Return a list of mappings as a list for each key, or a list of lists as one for each channel.
 
+    Mappings that hold lists, like `{"name": "force", "data": [...]}`, become one for each name, if
+    the texts under some key are all different; the first such key counts.
+
     The shorter axis of a list of lists is the channels (of equal ones the first), which are
     numbered from 0. A NumPy array counts as a list. A mapping is returned as it is, and None for
     any other value, also an empty list. Keys that the first mapping of a list lacks are left out.
@@ -101,7 +104,12 @@ def _turned(value: Any) -> Mapping[Any, Any] | None:
         return value
     first = value[0] if isinstance(value, ITEMS) and len(value) else None
     if isinstance(first, Mapping):
-        return {key: [item[key] for item in value] for key in first}
+        columns = {key: [item[key] for item in value] for key in first}
+        has_curve = any(isinstance(cells[0], ITEMS) for cells in columns.values())
+        for cells in columns.values() if has_curve else ():
+            if {*map(type, cells)} == {str} and len({*cells}) == len(cells):
+                return dict(zip(cells, value, strict=True))
+        return columns
     if not isinstance(first, ITEMS):
         return None
     x = np.array(value, dtype=object)

@@ -19,7 +19,7 @@ from .text import read_text, to_utf8
 
 DELIMITERS = (",", ";", "\t", "|")
 SUFFIX = re.compile(r"\.[A-Za-z]\w{0,7}(\.gz)?$")  # of a file
-MARKS = " \t;,:=\"'"  # around the words of a line
+MARKS = " \t;,:：=\"'"  # around the words of a line
 
 
 def without_label(source: LabelSource, path: str) -> str:
@@ -60,18 +60,22 @@ def path_word(path: str, pattern: str) -> str:
 def line_word(lines: Sequence[str], beginning: str) -> str:
     """Return the word behind `beginning` in a line that begins with it, "" if there is none.
 
-    If several lines begin with it, the first is used in which it fills the whole first cell, or
-    else the first. Comment marks, quotes and delimiters before `beginning` are skipped. So are
-    blanks, tabs, quotes and `; , : =` behind it; then the word goes up to the next `;`, tab or
-    comma, without such marks at its end. Raises UnreadableError if no line begins with the text.
+    If several lines begin with it, those are used in which it fills the whole first cell, or else
+    all. Comment marks, quotes and delimiters before `beginning` are skipped. So are blanks, tabs,
+    quotes and `; , : =` behind it; then the word goes up to the next `;`, tab or comma, without
+    such marks at its end. Raises UnreadableError if no line begins with the text, or if the words
+    of several differ.
 
     lines : the lines above the header of a file.
     """
     texts = [line.lstrip(f"#%*{MARKS}") for line in lines]
     texts = [text[len(beginning) :] for text in texts if text.startswith(beginning)]
-    for text in sorted(texts, key=lambda text: re.match(r"[\"' ]*([;:=\t,]|  |$)", text) is None):
-        return re.split(r"[;\t,]", text.strip(MARKS))[0].strip(MARKS)
-    raise UnreadableError(f"Expected a line above the header that begins with {beginning}")
+    whole = [text for text in texts if re.match(r"[\"' ]*([;:：=\t,]|  |$)", text)]
+    words = {re.split(r"[;\t,]", text.strip(MARKS))[0].strip(MARKS) for text in whole or texts}
+    if len(words) != 1:
+        wanted = f"one word behind {beginning} in the lines above the header"
+        raise UnreadableError(f"Expected {wanted}, got {listed(words) or 'no such line'}")
+    return words.pop()
 
 
 def words_of(
@@ -140,12 +144,13 @@ def in_listing(name: str) -> Iterator[None]:
 class LabelReader:
     """Finds the label of a recording in one source.
 
-    listing : the words by key, if the source is a listing. used : the keys that were found in it.
+    listing : the words by key, if the source is a listing. used : the keys that were found in it,
+    each with the path of the first recording that has it.
     """
 
     source: LabelSource
     listing: Mapping[str, Sequence[str]]
-    used: set[str] = field(default_factory=set)
+    used: dict[str, str] = field(default_factory=dict)
 
     def words(self, table: Table, part: str) -> Sequence[str]:
         """Return the words that stand for the label of a recording, like "ok".
@@ -153,14 +158,14 @@ class LabelReader:
         `table` is the table of the recording, and `part` its part number. If the source is a
         listing, they are the words of all its rows with the key of the recording. The key is the
         first of these that is listed: the number of the part, the path, the file name, the path
-        without suffix, the file name without suffix. It is added to `used`, the set of keys found
-        so far. Any other source gives one word.
+        without suffix, the file name without suffix. It is added to `used`, the keys found so
+        far. Any other source gives one word.
 
         Raises
         ------
         UnreadableError
             If there are no words for the recording, or if its rows have different ones and
-            `source.at` is "same".
+            `source.at` is "same". If the key, a file's name, was found for another path before.
         DataError
             If `source.path` is no regular expression with one group.
         """
@@ -176,14 +181,18 @@ class LabelReader:
                 f"Expected {part or name} in {source.listing}, it is not listed; it has "
                 f"{listed(sorted(self.listing)[:2])}; if its name contains the key, state part.path"
             )
-        self.used.add(keys[0])
+        if self.used.setdefault(keys[0], path) != path and keys[0] != as_key(part):
+            raise UnreadableError(
+                f"Expected a row of {source.listing} for each file, {keys[0]} also names "
+                f"{self.used[keys[0]]}"
+            )
         return self.listing[keys[0]]
 
     def label(self, table: Table, part: str) -> int | None:
         """Return the label of a recording: 1 good, 0 bad, None not checked.
 
         `table` is the table of the recording, and `part` its part number. If the source is a
-        listing, the key that was found in it is added to `used`, the set of keys found so far.
+        listing, the key that was found in it is added to `used`, the keys found so far.
         Words are compared exactly; a word that is stated for several meanings is good before bad,
         and bad before not checked. Raises UnreadableError if there is no label, if rows of the
         listing contradict each other, if the recording's own rows have different words while
@@ -208,7 +217,7 @@ class LabelReader:
 
         It has the keys of up to eight of them, with the number of all.
         """
-        unused = sorted(self.listing.keys() - self.used, key=natural_key)
+        unused = sorted(self.listing.keys() - self.used.keys(), key=natural_key)
         if not unused:
             return ""
         return (

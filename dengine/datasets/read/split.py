@@ -15,7 +15,7 @@ from . import frames
 from .clock import is_dated
 from .text import NUMBER, WORD, Kind, read_text
 
-NUMBERED = r"(\d+(?:\.\d+)?)"  # for which `*` stands in a wide table: `F*` is not `Fmax`
+NUMBERED = r"(\d+(?:\.\d+)?(?:e-?\d+)?)"  # for which `*` stands in a wide table: `F*` is not `Fmax`
 OBJECTS = ("json", "jsonl", "ts")
 
 
@@ -95,9 +95,10 @@ def split(table: Table, description: Description) -> Iterator[Table]:
 
     `long`: the rows with the same words in `part.column` are a part; they must stand together,
     unless `time.sort` is set. `columns`: each column that matches the first channel is a part.
-    `wide`, `npz`, and the formats json, jsonl and ts: each row is a part; its samples are the list
-    in a cell, or the cells of the columns that match the channel with a number for its `*`, in the
-    order of these numbers. Otherwise the file is one part.
+    `wide`, `npz`, and a file of the formats json, jsonl and ts with one row or with lists as cells:
+    each row is a part; its samples are the list in a cell, or the cells of the columns that match
+    the channel with a number for its `*`, in the order of these numbers. Otherwise the file is one
+    part.
 
     In numbered columns and in the layout `columns`, empty cells at the end are no samples. A part
     has `damage` if its row is damaged, or if a list of lists or mappings in it has items of
@@ -113,10 +114,18 @@ def split(table: Table, description: Description) -> Iterator[Table]:
         yield from _split_rows(table, description)
     elif layout == "columns":
         yield from _split_columns(table, description)
-    elif layout in ("wide", "npz") or description.format in OBJECTS:
+    elif layout in ("wide", "npz") or (
+        description.format in OBJECTS and (len(table.lines) == 1 or has_lists(table))
+    ):
         yield from _split_wide(table, description)
     else:
         yield table
+
+
+def has_lists(table: Table) -> bool:
+    """Return whether the first cell of any column is a list or array of two items or more."""
+    cells = [column[0] for column in table.columns.values() if len(column)]
+    return any(isinstance(cell, list | np.ndarray) and len(cell) > 1 for cell in cells)
 
 
 def _split_rows(table: Table, description: Description) -> Iterator[Table]:

@@ -163,7 +163,7 @@ def _read_plain(content: bytes, table: Table, form: TextForm, kind_of: Kind) -> 
 
     Not plain are a row with a wrong number of cells, an empty line, an empty last cell, a cell with
     a line break, and one that is not a finite number in a column of numbers, like an empty one; nor
-    is a file of which `form.drop` leaves out lines.
+    is a file of which `form.drop` leaves out lines, or in which a number means a lost sample.
 
     table : has the names of the columns, which are empty, and the lines of the rows. kind_of :
     returns the kind of a column: "number", "word" (its cells are read as texts), or "" if it is not
@@ -171,7 +171,7 @@ def _read_plain(content: bytes, table: Table, form: TextForm, kind_of: Kind) -> 
     """
     import pandas as pd
 
-    if form.drop:
+    if form.drop or any(word[-1:].isdigit() for word in form.missing):
         return None
     kinds = {name: kind_of(name) for name in table.columns}
     try:
