@@ -213,7 +213,8 @@ def _trace_line(dataset: "Dataset", i: int) -> str:
 def simulate(n: int, out: Path, scenario: str, seed: int, n_jobs: int, force: bool) -> None:
     """Simulate insertions and write their forces and labels.
 
-    They go into an .npz file; one that exists is replaced only with --force. The number of
+    They go into an .npz file; one that exists is refused before the simulation, or replaced with
+    --force. The file is written at the end, so Ctrl-C leaves none or the old one. The number of
     successes, the parts that sit correctly, is printed. MuJoCo must be installed, which the extra
     sim does; without it the exit code is 1.
     """
@@ -254,12 +255,13 @@ def train(
     Each trace counts once, however often its file is imported. A bad trace (not finite, constant)
     is stored, but never trained on. A store that has been used has its own recipe and seed: leave
     these options out, because other values are refused. Recordings are brought to the length of the
-    store's traces. If there is a version, no label is new to it, and it lacks no training step,
-    nothing is trained. Otherwise a version that a rollback pinned is released first. If training
-    needs more time than the recipe's time budget, several retrains follow each other. The exit code
-    is 1 if a new version is dropped, or if training steps are missing at the end, because ten
-    retrains in a row had no time for a single step. If steps are missing, and after Ctrl-C, which
-    keeps what was imported, the same command continues there.
+    store's traces. If there is a version, no label is new to it, and it lacks no training step (a
+    step of the optimizer), nothing is trained. Otherwise a version that a rollback pinned is
+    released first. If training needs more time than the recipe's time budget, several retrains
+    follow each other. The exit code is 1 if a new version is dropped, or if training steps are
+    missing at the end, because ten retrains in a row had no time for a single step. If steps are
+    missing, and after Ctrl-C, which keeps what was imported, the same command continues there. The
+    subcommand is refused while an engine runs on the cell.
     """
     from ..datasets.importing import import_labelled, in_form_of
     from ..engine.engine import DataEngine

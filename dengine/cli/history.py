@@ -244,7 +244,8 @@ def explain(store: str, decision: str, neighbours: int, out: Out | None) -> None
     store is refused, too, and so is one whose trace, or a neighbour's, is damaged. Counts, bound
     and action are shown as they were recorded. Neighbours are searched again with the version that
     decided, if the store still has it. The picture of --out shows the trace with its neighbours and
-    with the band that holds 95 % of the known successes.
+    with the band that holds 95 % of the known successes. Damaged labels, and damaged traces of this
+    band, are left out, and an event in the store records this.
     """
     from ..errors import ReportError
     from ..experiments.figures import explained_picture

@@ -479,11 +479,20 @@ class DataChoice:
         """Load the data set, with a progress bar, and return it.
 
         It has only the channels and samples that the options `--channels` and `--samples` ask for.
-        Its notes, and the first three recordings that were left out, are printed to stderr, but not
-        with `--json`. `description` is the description to read by; None takes the one that
-        `describe` returns. Raises the errors of `load_dataset`: DataError if the data set cannot be
-        read, if a description is needed and none is saved, or if it has a `?`; SettingError for a
-        malformed trigger; StoreError for a store that cannot be opened or read.
+        `Dataset.notes`, and the first three recordings that were left out, are printed to stderr,
+        but not with `--json`. `description` is the description to read by; None takes the one that
+        `describe` returns.
+
+        Raises
+        ------
+        DataError
+            If the data set cannot be read, a channel does not exist, or the traces are shorter than
+            `--samples`. Also if a description is needed and none is saved, if it has a `?`, or if a
+            stated key is unknown or its value has the wrong type.
+        SettingError
+            If `windows.trigger` of the description is malformed.
+        StoreError
+            If the data set is a store that cannot be opened or read.
         """
         from ..datasets import load_dataset
         from ..datasets.loading import count_files
@@ -621,7 +630,8 @@ def data_options(
         The data set is the subcommand's argument DATA, required, instead of an option; `default` is
         not used.
     live : bool, default False
-        Whether to add the options of live traces: `--rate-hz`, `--unit`, `--fit` and `--trigger`.
+        Whether to add the options of live traces, those that a cell records now: `--rate-hz`,
+        `--unit`, `--fit` and `--trigger`.
     """
     metavar = "NAME|FILE|FOLDER"
     if argument:

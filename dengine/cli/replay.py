@@ -252,9 +252,10 @@ def compare(
     Methods are reducers and baselines, each with a name of its own. They are played under one
     policy or a grid of policies: give a setting either as one value (--alpha) or as a list to try
     (--alphas); both are a usage error. --paper gives the lists of the paper, each unless you give
-    your own. For each method the output is that of `dengine replay`. umap-learn takes much longer
-    than the others. Ctrl-C, or an error in a replay, ends it and shows the replays that were
-    finished.
+    your own; beside it, one value of alpha, the lower bound or the interval is a usage error. The
+    output is that of `dengine replay`, in one table with a row for each method and policy.
+    umap-learn takes much longer than the others. Ctrl-C (exit code 130), or an error in a replay
+    (1), ends it and shows the replays that were finished.
     """
     short_names = [short_name(name) for name in names]
     if len(set(short_names)) < len(short_names):

@@ -87,17 +87,18 @@ def run(
 ) -> None:
     """Drive a cell: verify, learn, and verify less.
 
-    With a store that exists the engine continues where it was. The simulated cell then makes new
-    parts, and a recording continues after its last part that was labelled or accepted: no part is
-    learned from twice. It is refused if it has fewer parts left than --cycles. A robot runs
-    dengine/cells/ur/ur_cell.script, or a program with the same handshake; --trigger and --samples
-    say what is recorded of it. If too many decisions are wrong, or too many traces are unlike all
-    known ones, the engine enters safe mode: parts are verified until new outcomes allow decisions
-    again. --shadow stays in force in the store, until `dengine policy STORE --shadow off`. At the
-    end a table shows what was decided, what was wrong and what was saved. Ctrl-C or SIGTERM ends
-    the run after the current cycle, and a second Ctrl-C at once; what was done is shown, and the
-    exit code is 130. A second SIGTERM ends the process, and nothing is shown. If the cell fails,
-    what was done is shown, too, and the exit code is 1.
+    With a store that exists the engine continues where it was. If you give an option of the recipe,
+    the whole recipe must then be the store's (conv if you name none); otherwise the store's recipe
+    is used. The simulated cell then makes new parts, and a recording continues after its last part
+    that was labelled or accepted: no part is learned from twice. It is refused if it has fewer
+    parts left than --cycles. A robot runs dengine/cells/ur/ur_cell.script, or a program with the
+    same handshake; --trigger and --samples say what is recorded of it. If too many decisions are
+    wrong, or too many traces are unlike all known ones, the engine enters safe mode: parts are
+    verified until new outcomes allow decisions again. --shadow stays in force in the store, until
+    `dengine policy STORE --shadow off`. At the end a table shows what was decided, what was wrong
+    and what was saved. Ctrl-C or SIGTERM ends the run after the current cycle, and a second Ctrl-C
+    at once; what was done is shown, and the exit code is 130. A second SIGTERM ends the process,
+    and nothing is shown. If the cell fails, what was done is shown, too, and the exit code is 1.
     """
     if kind == "simulated":
         options.require_modules("the simulated cell", "sim", "mujoco")

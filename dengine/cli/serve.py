@@ -114,8 +114,9 @@ def serve(
     """Answer robots, controllers and people.
 
     Continues with its store, which must have the settings that are given, or starts a new one, and
-    retrains in a separate process. It runs until SIGTERM or Ctrl-C, which end it in order, with
-    exit code 0: waiting requests are answered, and everything known is written. --shadow stays in
+    retrains in a separate process. It runs until SIGTERM or Ctrl-C. Then waiting requests are
+    answered, within 5 s, everything known is written, and the exit code is 0; a second Ctrl-C does
+    not wait for the requests. --shadow stays in
     force in the store, until `dengine policy STORE --shadow off`. --demo plays recorded parts as a
     robot would, with a deadline of 5 s or more, and without a recipe under conv with alpha 0.1, LB
     90 % and 5 % of audits. It keeps them in a new --store, or without --store forgets them at the

@@ -216,12 +216,15 @@ def policy(store: str, settings: dict[str, Any], author: str, allow_import: bool
     """Show the policy in force, or change it.
 
     Without options it is shown, even while an engine runs on the cell; a change is refused then. A
-    change is recorded as an event. A setting that is not given stays as it is, but --prices alone
+    change is recorded as an event; settings that are in force already change nothing. A setting
+    that is not given stays as it is, but --prices alone
     also change the guarantee local or pooled to cost, and an audit rate of 0 to 0.05. Earlier
     decisions keep their bounds. The certificate starts again after any change. The rule also
     forgets what it learned, after a change of --alpha, --lower-bound, --interval, --guarantee,
-    --stops or --prices, and with some guarantees of --audit-rate: a tolerance that is chosen after
-    the data was seen needs fresh evidence. Shadow mode lasts over restarts; `dengine status` counts
+    --stops or --prices, and, under pooled or cost with --stops some, of --audit-rate: a tolerance
+    that is chosen after the data was seen needs fresh evidence. A model that was handed in keeps
+    its rule, and a change of these settings other than --stops and --audit-rate is refused.
+    Shadow mode lasts over restarts; `dengine status` counts
     what the model would have done, and how much of it was wrong.
     """
     if settings:
@@ -249,11 +252,11 @@ def retrain(store: str, author: str, allow_import: bool) -> None:
     """Train now, on the store's labels with all corrections.
 
     An event records it, also if the version is dropped. The new version replaces a pinned one, too;
-    a pinned version is released first. If the recipe's time budget ends before the training does,
-    the output says how many steps are to go, and the next retrain continues. If the training fails
-    or has no label to train on, or the new version fails its tests, it is dropped, the previous
-    version stays in use, and the exit code is 1. The subcommand is refused while an engine runs on
-    the cell.
+    a pinned version is released first, and stays released if the new version is dropped. If the
+    recipe's time budget ends before the training does, the output says how many steps are to go,
+    and the next retrain continues. If the training fails or has no label to train on, or the new
+    version fails its tests or cannot be stored, it is dropped, the previous version stays in use,
+    and the exit code is 1. The subcommand is refused while an engine runs on the cell.
     """
     from ..engine.engine import DataEngine
     from ..experiments.tables import retrain_line
@@ -311,7 +314,8 @@ def verify(
     journal, data that was lost, and a --expect that the history does not hold, at most 20 in all
     (--json: each that was found). If there are any, the exit code is 1. For each cell it shows the
     number of entries and rows, and the newest digest: keep it elsewhere for --expect. It also says
-    if a cell's journal is missing, which alone is no fault. The subcommand writes rows only with
+    if a cell's journal is missing, or holds records that the store lacks; neither alone is a fault.
+    The subcommand writes rows only with
     --acknowledge, after which it checks again (an SQLite file is set to WAL mode if it is not).
     Engines may run meanwhile.
     """
@@ -452,7 +456,8 @@ def import_labels(journal: Path, store: str, any_model: bool) -> None:
 
     JOURNAL is the CSV file that the program wrote. Each line counts once, however often it is
     imported; a label that contradicts the store's is counted, but not stored. Under the policy
-    --stops all, an accepted part without a report is imported as good, unless it is the last part.
+    --stops all, an accepted part without a report is imported as good, unless it is the last part;
+    under some it is imported without a label. Other parts without a label are left out.
     If a line was changed or is missing, the lines before it are imported, the others are not, and
     the exit code is 1. A file that is no journal, has no accepted or labelled part, has a line that
     cannot be read, or belongs to another model (unless --any-model, or the store records no export)

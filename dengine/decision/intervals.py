@@ -336,8 +336,8 @@ def _clip_limits(
 
     The result is (lower, upper), which is (0, 1) if nothing was counted. `lower` and `upper` are
     the computed limits, `n_success` and `n_failure` the counts. All are float64 arrays (`xp` is
-    numpy) or tensors (`xp` is torch). Rounding alone could push a limit past the rate or out of
-    [0, 1].
+    numpy) or tensors (`xp` is torch). A Wald limit may be out of [0, 1]; rounding, or an alpha near
+    1, may push a limit past the rate.
     """
     total = n_success + n_failure
     rate = n_success / xp.where(total > 0.0, total, 1.0)

@@ -264,8 +264,8 @@ class MemberEvidence(nn.Module):
         `novel` says whether the trace of this part was novel. Outside of a safe mode it steps the
         detector of novel traces. In a safe mode that began because of novel traces, the sum of that
         detector counts how long few traces have been novel, by which `update` ends the safe mode: a
-        trace that was not novel adds 1, a novel one takes 4 from the sum, or from 0 if that was
-        lower. In any other safe mode `novel` has no effect.
+        sum below 0 is first taken as 0, then a trace that was not novel adds 1, a novel one takes
+        4. In any other safe mode `novel` has no effect.
         """
         self.step_detector(Detector.ACCEPTED_PARTS.value, self.correct_step, n_unreported)
         safe_mode = int(self.safe_mode.item())
@@ -383,10 +383,11 @@ class MemberEvidence(nn.Module):
         the new sum may be one step below 0. If `times` is above 1, `step` must be negative: only
         the new sum is compared with the limit. Nothing happens if `times` is 0 or less.
 
-        An alarm starts the safe mode (both sides are closed), or starts it anew during one, and
-        sets the sums of all detectors to 0. During a safe mode the reason becomes the one of the
-        old and the new that stands first in `SafeMode`: a side that has not shown its tolerance yet
-        stays the reason if an alarm of novel traces follows.
+        An alarm starts the safe mode (both sides are closed), or starts it anew during one. It sets
+        the sums of all detectors and the counts since the last alarm to 0 (`start_safe_mode`).
+        During a safe mode the reason becomes the one of the old and the new that stands first in
+        `SafeMode`: a side that has not shown its tolerance yet stays the reason if an alarm of
+        novel traces follows.
         """
         if times <= 0:
             return
@@ -426,7 +427,8 @@ class MemberEvidence(nn.Module):
         strictest level. The threshold is the score of the target if such a level was found, all
         members (the parts that the promise is about) so far give enough evidence, and the members
         since an alarm, if there was one, show recovery (`members_to_recovery` is 0 or less);
-        otherwise it is `CLOSED`, which no score reaches.
+        otherwise it is `CLOSED`, which no score reaches. Recovery is not asked for outside of a
+        safe mode if the side had no member before the alarm.
 
         The watched rule (the paper's rule with a safe mode) has no target. Only an alarm closes its
         threshold, which becomes the first level again once the members since the alarm show

@@ -137,14 +137,14 @@ class NoveltyGate(nn.Module):
     def plain_features(self, x: Tensor) -> Tensor:
         """Return the features of traces (..., C, T) that are not distortions, (..., P) float32.
 
-        A channel is cut into S segments, overlapping stretches of equal length that together cover
-        the trace. For each channel the features are the S minima and the S maxima of the segments,
-        then 2*S + 3 logarithms of roughness, which is the norm of the differences of successive
-        samples in a stretch, plus `noise_floor`. The first S are of first differences in the
-        segments, the next S of second differences in the segments. The last three, for gaps, are of
-        first differences in brief stretches, which have a hundredth of the samples of a trace,
-        rounded down, and at least one: the least roughness over stretches of twice that length,
-        then the least and the largest over stretches of that length.
+        A channel is cut into S segments, stretches of equal length that together cover the trace,
+        and may overlap. For each channel the features are the S minima and the S maxima of the
+        segments, then 2*S + 3 logarithms of roughness, which is the norm of the differences of
+        successive samples in a stretch, plus `noise_floor`. The first S are of first differences in
+        the segments, the next S of second differences in the segments. The last three, for gaps,
+        are of first differences in brief stretches. Such a stretch has T / 100 differences, rounded
+        down, and at least one: the least roughness over stretches of twice that length, then the
+        least and the largest over stretches of that length.
         """
         pieces = x.unfold(-1, self.length, self.stride)  # (..., C, S, L)
         steps = x[..., 1:] - x[..., :-1]  # from sample to sample
@@ -257,9 +257,10 @@ def _noise_floor(gate: NoveltyGate, x: Tensor) -> Tensor:
 
     `gate` says how many samples each of the 2*S + 3 roughnesses of a channel is taken over (they
     are norms of differences in a stretch of samples, see `plain_features`). The result is a
-    twentieth of the median roughness of the traces x (n, C, T), times the root of the share of
-    samples in the stretch, and at least 1e-12, as for a channel that is constant in half of the
-    traces or more: any movement there is then far away.
+    twentieth of the roughness of a whole trace (the norm of its first differences in the channel,
+    as the median over the traces x (n, C, T)), times the root of the share of samples in the
+    stretch, and at least 1e-12, as for a channel that is constant in half of the traces or more:
+    any movement there is then far away.
     """
     n_samples = x.size(2)
     steps = torch.zeros(x.size(1))
@@ -349,7 +350,8 @@ def _find_same(traces: NDArray[np.float32], parts: NDArray[np.int64] | None) -> 
 
     `traces` is (n, C, T), `parts` (n,) holds the hash of the part of each trace. The first result
     is (n, n) bool, with a diagonal of True. The second counts the traces that are not the same as
-    an earlier one. If `parts` is None, only equal traces are the same.
+    an earlier one. Traces with the hash 0 are of one part, too. If `parts` is None, only equal
+    traces are the same.
     """
     numbers: dict[bytes, int] = {}
     content = np.array([numbers.setdefault(x.tobytes(), len(numbers)) for x in traces])

@@ -170,8 +170,8 @@ class Policy:
     def _checked_prices(self) -> tuple[float, float, float]:
         """Return the three prices as floats.
 
-        Raises SettingError if they are not three finite numbers above 0, or if an error costs no
-        more than two checks.
+        Raises SettingError if they are no tuple or list of three finite numbers above 0, or if
+        an error costs no more than two checks.
         """
         given = self.prices if isinstance(self.prices, tuple | list) else ()
         prices = [float(price) for price in given if is_number(price)]

@@ -80,8 +80,9 @@ class Candidate:
 
         The model takes over the rule of the previous model, which decides until now. If the
         compiled model gives another result than the trained one, or raises, the training is
-        dropped: `model` becomes None, and the report says why. An exception, also one while the
-        rule is taken over, is logged and not raised. If `model` is None already, nothing is done.
+        dropped: `model` becomes None, and the report says why. An exception while the rule is taken
+        over drops it, too. Exceptions are logged and not raised. If `model` is None already,
+        nothing is done.
         """
         if self.model is None:
             return

@@ -1,8 +1,7 @@
 """`Corrections`: with it people correct a label, forget labels, go back to an earlier version and
 release it, or set another policy. The methods of `DataEngine` that do this call it.
 
-    engine.correct(decision.id, success=False, author="kim")
-    engine.rollback(3)
+    engine.correct(decision.id, success=False, author="kim") engine.rollback(3)
 
 Each change is an event that is kept for ever. Nothing is overwritten: a correction is a later row,
 an earlier version is put in force again as a new version, and a decision stays as it was decided.
@@ -316,6 +315,8 @@ class Corrections:
         somebody chooses the best of the certificates of m policies, the error probability of that
         certificate is up to m alpha.
 
+        A handed-in model keeps its rule, whatever changes.
+
         A safe mode goes on until new outcomes end it. If the new rule has no safe mode, the safe
         mode ends now, an event is recorded, and `on_safe_mode`, the user's function, is called. An
         accepted part whose outcome was not reported before the change stays unreported. With
@@ -425,7 +426,8 @@ class Corrections:
         fitted again as a new version. The store is checked against its ledger; a difference sets
         the outbox's `integrity_error`. If a safe mode begins or ends by this, an event is recorded,
         and `on_safe_mode`, the user's function, is called. Raises StoreError if the store does not
-        answer, and what a pinned model raises that is fitted again; a change that is stored by then
+        answer, or if another cell of the product stores a version while a pinned model is fitted
+        again, and what a pinned model raises that is fitted again; a change that is stored by then
         is applied with the next one, or when the store is opened again.
         """
         number = self._store.corrections.apply(change)

@@ -210,16 +210,17 @@ class DecisionMaker:
     def record_timeout(self, trace: ArrayLike, part: Any, decision_id: Any) -> Decision:
         """Record VERIFY, `Reason.LATE`, while another thread may use the engine, and return it.
 
-        Any thread may call it. It returns once the decision is on disk, or when the store's time
-        limit is over. A fault of the trace or the store is the reason instead of LATE. If the id
-        has a decision already, that decision is returned. If the id cannot be looked up, the result
-        is a VERIFY with `Reason.NO_STORE` that is not recorded. With a store in memory, and while
-        no `TraceSpec` is in force, the VERIFY is not recorded either, and the trace is not looked
-        at: only the thread that uses the engine may do that.
+        Any thread may call it. It returns once the decision is on disk, when a write fails, or when
+        the store's time limit is over; the last two are not raised. A fault of the trace or the
+        store is the reason instead of LATE. If the id has a decision already, that decision is
+        returned. If the id cannot be looked up, the result is a VERIFY with `Reason.NO_STORE` that
+        is not recorded. With a store in memory, and while no `TraceSpec` is in force, the VERIFY is
+        not recorded either, and the trace of a new id is not looked at: only the thread that uses
+        the engine may do that.
 
         Raises TraceError for an invalid part number, an id that belongs to another trace, and a
-        trace that does not fit the `TraceSpec` in force, and ReportError for an invalid id. What
-        the outbox does not take is not raised, and rule and model learn nothing of it.
+        trace that does not fit the `TraceSpec` in force or holds values that are no real numbers,
+        and ReportError for an invalid id. Rule and model learn nothing of the decision.
         """
         id_ = as_id(decision_id)
         number = as_part(part)

@@ -463,13 +463,14 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         """Finish a retrain under way, within seconds, write everything, and close the store.
 
         A retrain that takes longer than 5 s is dropped. In a product the news of the other cells is
-        taken in before; if the store does not answer then, the retrain is lost. A second call does
-        nothing, nor does one in a forked process. Records that only the database does not take stay
-        in the journal. Records that the disk does not take are given up, and an error is logged; no
-        call has said that they are on disk. If the disk hangs, the store stays open, and no other
-        engine can own the cell until the process ends. With `replaying=True` this waits for the
-        disk and the database without a time limit. A store in memory stays open. Raises StoreError
-        while another thread uses the engine.
+        taken in before; if it has a correction or a rollback, or the store does not answer, a
+        retrain that is not in force yet is lost. A second call does nothing, nor does one in a
+        forked process. Records that only the database does not take stay in the journal. Records
+        that the disk does not take are given up, and an error is logged; no call has said that they
+        are on disk. If the disk hangs, the store stays open, and no other engine can own the cell
+        until the process ends. With `replaying=True` this waits for the disk and the database
+        without a time limit. A store in memory stays open. Raises StoreError while another thread
+        uses the engine.
         """
         with self._exclusive:
             if self._outbox.is_usable:
@@ -502,11 +503,12 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         """Decide on one trace, and record the decision.
 
         Before that, a version that the executor has trained is taken one step further (the steps
-        are test, store, put in force; in a product all are taken), and accepted parts without a
-        report are confirmed (`Policy(stops="all")`) or counted as unreported. A rule that lacks a
-        correction is put right, as by `flush`. Checks that become overdue update the rule. If a
-        safe mode began or ended, an event is recorded, and `on_safe_mode` is called. For an id that
-        has a decision nothing of this is done, and that decision is returned.
+        are test, store, put in force; in a product all are taken, after the other cells' news, and
+        the call waits for the store), and accepted parts without a report are confirmed
+        (`Policy(stops="all")`) or counted as unreported. A rule that lacks a correction is put
+        right, as by `flush`. Checks that become overdue update the rule. If a safe mode began or
+        ended, an event is recorded, and `on_safe_mode` is called. For an id that has a decision
+        nothing of this is done, and that decision is returned.
 
         Parameters
         ----------
@@ -761,7 +763,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         next `decide`, `report` or `poll` does. Raises StoreError if the release of a pinned version
         cannot be stored, if the labels that came before cannot be stored, in a product if the store
         does not answer, and for an engine that is closed, was opened for reading or before a fork,
-        or is in use by another thread.
+        or is in use by another thread. What the copying of a handed-in model raises is raised, too.
 
         Parameters
         ----------
@@ -769,8 +771,9 @@ class DataEngine(AbstractContextManager["DataEngine"]):
             True: a version that is already trained is first put in force or dropped, and a training
             that is not done is discarded. With an executor the first such call also loads the
             modules that a retrain imports; if that fails, it is logged. False: begin to retrain in
-            the executor, and return None. If a retrain is under way, nothing is begun; if the
-            executor cannot begin yet, `poll` or `report` begins it. `poll` brings it to its end.
+            the executor, and return None. If a retrain is under way, nothing is begun, and a
+            trained version is taken one step further (in a product, all steps); if the executor
+            cannot begin yet, `poll` or `report` begins it. `poll` brings it to its end.
             Without an executor it runs in this thread, and its report is returned.
 
         Returns
@@ -823,6 +826,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         StoreError
             While another thread uses the engine, and if it is closed, was opened for reading or
             before a fork.
+        Exception
+            What the copying of a handed-in model raises, before a retrain.
         """
         self._outbox.check_usable()
         with self._exclusive:

@@ -187,7 +187,7 @@ class Feedback:
         had confirmed the part as good (CONFIRMED), a line stop is recorded but not learned yet, and
         `remedy`, which says what must be done later, is set to CORRECT. It is set to REBUILD_RULE,
         unless it is set already, if the rule had counted the part's check as overdue. Raises
-        ReportError if the decision has any other label; then nothing is changed.
+        ReportError for any other report on a decision with a label; then nothing is changed.
         """
         decision = stored.decision
         source = source_of(decision, success)
@@ -213,10 +213,10 @@ class Feedback:
         of the model or the rule is logged and not raised; if the rule raised, it is stale, and
         every part is verified. The label of a rejected part that was inspected becomes a reference
         and does not update the rule: which parts are inspected is somebody's choice, and no sample.
-        Every other label also tells the rule how many accepted parts went on unreported since the
-        last label, and this count begins again at 0, even if the decision is from before the
-        present rule and so does not update it. A part that was counted among them is subtracted
-        from the number that its own label tells, which may make it -1.
+        Every other label of a trace without a fault also tells the rule how many accepted parts
+        went on unreported since the last label, and this count begins again at 0, even if the
+        decision is from before the present rule and so does not update it. A part that was counted
+        among them is subtracted from the number that its own label tells, which may make it -1.
 
         The label takes the next number of the outbox. The label of a trace without a fault counts
         as new and enters the training window; in a product it is read into that from the store,

@@ -151,8 +151,9 @@ class Learner:
         waits for a later call while the store lacks any record or has a fault. Before a correction
         a retrain under way is ended (`end_training`), and the store is checked against its ledger:
         after a difference every part is verified. A model that cannot change its references is
-        retrained here, or, if it is pinned, fitted again, and what that raises is raised. If the
-        store fails meanwhile, that is logged and not raised, and a later call tries again.
+        retrained here, or, if it is pinned, fitted again. Nothing is raised: if the store fails
+        meanwhile, that is logged, and a later call tries again; any other exception, as of a model
+        that is fitted again, is logged, and it is not tried again.
         """
         self.feedback.number_labels()
         if self.feedback.remedy is None or not self._outbox.is_drained or self._outbox.fault:
@@ -203,7 +204,8 @@ class Learner:
         A version that fails or cannot be stored is dropped, and the report says so. If the version
         is stored, but labels that came since cannot be, it is put in force by a later call; its
         report is returned all the same. Raises StoreError if the labels before the training cannot
-        be stored, and in a product if the store does not answer; no training begins then. With
+        be stored, and in a product if the store does not answer; no training begins then. What the
+        copying of a handed-in model raises is raised; no label counts as new then. With
         `wait` True no training may be under way (`end_training`).
         """
         if not wait:
@@ -605,13 +607,13 @@ class Learner:
         If the model cannot change a reference and `may_retrain` is True, it is retrained in this
         thread, or, if it is pinned, fitted again as a new version; only the cell that corrected
         does so, and no training may be under way then (`end_training`). If the next training does
-        not start from the model in force, because labels were
-        forgotten, its features are computed in advance (`_precompute_other_start`). The store is
-        checked against its ledger; a difference sets the outbox's `integrity_error`, after which
-        every part is verified. A damaged trace is reported by an event in the store. With no new
-        correction the window is read and the rule rebuilt, too; a baseline is then retrained all
-        the same. Raises StoreError if the store is unavailable, and, for a pinned model that is
-        fitted again, what `roll_back` raises.
+        not start from the model in force, because labels were forgotten, its features are computed
+        in advance (`_precompute_other_start`). The store is checked against its ledger; a
+        difference sets the outbox's `integrity_error`, after which every part is verified. A
+        damaged trace is reported by an event in the store. With no new correction the window is
+        read and the rule rebuilt, too; a baseline is then retrained all the same. Raises StoreError
+        if the store is unavailable, and, for a pinned model that is fitted again, what `roll_back`
+        raises.
         """
         self._outbox.check_integrity(0)  # the rule is rebuilt from all of it
         corrections = self._store.corrections.after(self.live.corrected_to)
@@ -664,7 +666,8 @@ class Learner:
     def roll_back(self, number: int, event: Change) -> None:
         """Put the earlier version `number` in force again, as a new version that is pinned.
 
-        It is stored together with `event`. Until then nothing changes, so all that can fail comes
+        No training may be under way (`end_training`). The version is stored together with `event`,
+        and the newest report is one of it. Until then nothing changes, so all that can fail comes
         before: checking the store against its ledger, reading the version, restoring it, and adding
         the later labels, up to the training window's capacity, as its references. A difference from
         the ledger sets the outbox's `integrity_error`, and a damaged trace is reported by an event
@@ -676,9 +679,9 @@ class Learner:
         A baseline, which is fitted again, gets the labels as they count now, since it cannot take
         a label back. An exception as the model takes over the rule in force is logged.
 
-        Raises StoreError if the version is not kept, if a trace is damaged that the model must be
-        fitted on again, and if the version cannot be stored, also because another cell of the
-        product stored one meanwhile; and what `restore_model` raises.
+        Raises StoreError if the version is not kept or is damaged, if a trace is damaged that the
+        model must be fitted on again, and if the version cannot be stored, also because another
+        cell of the product stored one meanwhile; and what `restore_model` raises.
         """
         begin = self._clock()
         self._outbox.check_integrity()
@@ -701,11 +704,12 @@ class Learner:
     def set_policy(self, policy: Policy | None, evidence: EvidenceWindow, event: Change) -> None:
         """Go on under another policy, as a new version of the same model.
 
-        The version is stored with `event`. With `policy` the decision rule starts anew and counts
-        the decisions that `evidence` names. With None only settings outside the model have changed,
-        and its rule goes on. Before the first retrain only the event is stored. A failure to make
-        the model with the new rule ready is logged. Raises SettingError if the rule cannot be made,
-        and StoreError if the event cannot be stored: then nothing changes.
+        The version is stored with `event`, and the newest report is one of it. With `policy` the
+        decision rule starts anew and counts the decisions that `evidence` names. With None only
+        settings outside the model have changed, and its rule goes on. Before the first retrain only
+        the event is stored. A failure to make the model with the new rule ready is logged. Raises
+        SettingError if the rule cannot be made, and StoreError if the event cannot be stored, also
+        because another cell of the product stored a version meanwhile: then nothing changes.
         """
         live = self.live
         template = live.template

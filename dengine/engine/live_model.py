@@ -178,8 +178,9 @@ class LiveModel:
 
         `trained_on` names the labels of its training. The attributes `answering` (the model in
         force), `version`, `newest_version` (unless it is larger already), `trained_on` and
-        `lacks_steps` (whether its training ended before all its optimiser steps) are set. The
-        caller hands the rule in force over to the model (`EngineModel.prepare`), before or after.
+        `lacks_steps` (whether its training made some of its optimiser steps, and not all) are set.
+        The caller hands the rule in force over to the model (`EngineModel.prepare`), before or
+        after.
         """
         self.answering = model
         self.version = version
@@ -367,7 +368,7 @@ class LiveModel:
         """Return the arrays by name with which the store can restore a model as a version.
 
         They hold the model with its rule (in place of a stale rule `rule_is_stale`; of a baseline
-        nothing), the numbers of the labels that it was trained on (`trained_on`), and the numbers
+        nothing), all fields of `trained_on` (such as its labels, and `pinned`), and the numbers
         of the newest correction that counts and of the newest decision that was examined for an
         overdue check. If an overdue check counts, they say so (`includes_overdue`): an engine that
         opens the store then does not take the stored rule, but rebuilds it. Some arrays are views.

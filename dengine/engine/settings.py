@@ -216,7 +216,8 @@ class EngineSettings:
 
         `request` holds settings by name, as `DataEngine` takes them; None is a setting that was not
         given. All settings of a recipe or policy in it are compared, its defaults included. An
-        unknown name is an error, too. For a model that was handed in only settings that have an
+        unknown name is an error, too; so are `model` and the names of `RunOptions`, which the
+        caller must take out before. For a model that was handed in only settings that have an
         effect on any model are compared (`LOOP_SETTINGS`: seed, trace, retrain_every, budget,
         max_steps, window, audit_rate, stops, label_within and force_limits).
 
@@ -326,8 +327,9 @@ def choose_recipe(reducer: Any, recipe: Any, given: Settings) -> Recipe:
 
     `recipe` is a Recipe, a name or a TOML file. If it is None, the default recipe of `reducer` is
     taken, or that of conv. A setting of None keeps the recipe's own. Raises SettingError if
-    `recipe` names another reducer than `reducer`, for a `recipe` that is none, and for a setting
-    out of range.
+    `recipe` names another reducer than `reducer`, for a `recipe` that is none, for a setting
+    out of range, and for a class that must be imported for a default and cannot be; TypeError for
+    an unknown setting.
     """
     source = recipe
     if source is None:

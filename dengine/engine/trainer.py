@@ -283,8 +283,8 @@ class Retrainer:
     def _step_seconds(self) -> float | None:
         """Return the seconds after which the next training begins no step; None without a budget.
 
-        They are 70 % of the time budget, or less if the newest trainings took longer for their last
-        step and the work after it, but not less than 30 %.
+        They are the time budget, less the longest time that one of the newest 20 trainings took for
+        its last step and the work after it; but at least 30 % and at most 70 % of the budget.
         """
         if self.budget is None:
             return None
@@ -316,7 +316,9 @@ class Retrainer:
         discarded one is done. Returns False, and begins nothing, if there is no executor, or if it
         refuses work, or hangs with a discarded training (is not done with it after 60 s). An
         executor that refuses work or hangs is started again if it can be, and otherwise one that
-        refuses work is given up. Logged are the refusal, a restart that fails, and the giving up.
+        refuses work is given up, unless it still works on a discarded training. Logged are the
+        first training, the refusal, a restart that fails, and the giving up. What copying a user's
+        model raises is raised.
         """
         executor = self.executor
         if executor is None:
@@ -340,8 +342,8 @@ class Retrainer:
     def discard(self) -> bool:
         """Give up the training under way, without waiting; return whether there was one.
 
-        Its outcome is lost. If the executor has begun with it, it goes on working, and the next
-        training begins when it is done.
+        Its outcome is lost, also if it is done and was not collected. If the executor has begun
+        with it, it goes on working, and the next training begins when it is done.
         """
         future = self.future
         if future is None:
@@ -446,16 +448,16 @@ def train_candidate(
     """Train a model on labelled traces and return the outcome.
 
     The outcome has the model, a reason in words, the number of steps, the durations of all and of
-    the last step with all after it, and the sequence numbers of the labels.
-    `successor` is the model, which this changes in place. No step begins after
-    `step_seconds` seconds or `max_steps` steps; None is no limit. Any exception, a window without
-    traces, and a defect of the trained model give an outcome without a model, whose reason begins
-    with "dropped: ". A training that reaches a limit ends early and is accepted; its reason says so
-    if the time budget ended it before its last step. The reason of each accepted training has the
-    note (a line for the operator) of the model's report, if there is one.
-    `clock` returns seconds. The modules that a training imports are loaded first;
-    their time does not count, and a failure of this is logged. Sets the present thread to one torch
-    thread. It is a plain function, so that any executor can run it.
+    the last step with all after it, and the sequence numbers of the labels. `successor` is the
+    model, which this changes in place. No step begins after `step_seconds` seconds or `max_steps`
+    steps; None is no limit. Any exception, a window without traces, and a defect of the trained
+    model give an outcome without a model, whose reason begins with "dropped: ". A training that
+    reaches a limit ends early and is accepted; its reason says so if the time budget ended it
+    before its last step. The reason of each accepted training has the note (a line for the
+    operator) of the model's report, if there is one. `clock` returns seconds. The modules that a
+    training imports are loaded first; their time does not count, and a failure of this is logged.
+    Sets the present thread to one torch thread. It is a plain function, so that any executor can
+    run it.
     """
     torch.set_num_threads(1)  # it holds for the present thread only
     guarded(NOT_PRECOMPUTED, successor.warm_up)

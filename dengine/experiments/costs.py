@@ -2,8 +2,7 @@
 user's own recordings. The subcommand `dengine costs` prints it.
 
     curve = cost_curve("insertion", check=5, escape=600, false_reject=30, recipe="pca", n_jobs=2)
-    print(curve.sentence)
-    curve.policy, curve.to_frame()
+    print(curve.sentence) curve.policy, curve.to_frame()
 
 A part's mean cost is check x verified + escape x (accepted and bad) + false_reject x (rejected and
 good), in one unit of the user's, over all parts of a replay, its beginning included. Verifying
@@ -435,8 +434,9 @@ def cost_curve(
     baseline plays), and the dearer half (of an odd number the larger half, but of three one) is
     left behind; policies that verified every part count as the dearest. All others are compared by
     their expected cost over all shuffles so far. The last two, or the only one, play fresh
-    shuffles, by which no policy was chosen. A policy that needs more good parts than a shuffle has
-    is not tried.
+    shuffles, by which no policy was chosen. A policy with a setting that is refused, like an LB out
+    of range, or that needs more good parts than a shuffle has, is not tried; the field
+    `out_of_reach` of the result says so.
 
     Parameters
     ----------
@@ -477,7 +477,8 @@ def cost_curve(
     Raises
     ------
     SettingError
-        A price, a policy, or a number of repeats or cycles out of range; a check that is not
+        A price, or a number of repeats or cycles, out of range; a recipe that cannot be read; no
+        policy that can be tried (those that are refused are left out); a check that is not
         cheaper than an escape; a false reject that costs nothing; recordings of one label, or too
         few for any policy. With `keep` also for a reducer that cannot be hashed.
     DataError

@@ -149,10 +149,11 @@ def embedding_map(replay: Replay, title: str = "") -> Figure:
     The left panel shows which parts were good and bad, the right one what was decided. A point is
     the mean over the embedding spaces of the folds, in its first two dimensions (0 for a second one
     that is missing), as it was at the decision; later retrains do not move it. Parts that no model
-    embedded are left out, on the left also parts of unknown truth. A circle with the recipe's
-    radius is the neighbourhood of the newest point. Without any point a text says so. If the first
-    dimension is a probability, the second says little: the vertical axis is then the cycle, and two
-    vertical lines bound the neighbourhood.
+    embedded, or whose embedding has another number of dimensions than the replay's newest, are left
+    out, on the left also parts of unknown truth. A circle with the recipe's radius is the
+    neighbourhood of the newest point. Without any point a text says so. If the first dimension is a
+    probability, the second says little: the vertical axis is then the cycle, and two vertical lines
+    bound the neighbourhood.
 
     Parameters
     ----------
@@ -434,9 +435,10 @@ def explained_picture(explanation: Explanation) -> Figure:
 
     The envelope is the band in which 95 % of the successes lie at each sample. Samples that are
     outside by more than a tenth of its width are shaded, but not one that stands alone. The picture
-    has a panel for each of at most four channels, in their order: those with the most shaded
-    samples, of equal ones the first. Without an envelope only the traces are drawn, of the first
-    four channels. The title has the decision's id, action and reason, the version and the label.
+    has a panel for each of at most four channels, in their order: those with the most samples so
+    far outside (those that stand alone count, too), of equal ones the first. Without an envelope
+    only the traces are drawn, of the first four channels. The title has the decision's id, action
+    and reason, the version and the label.
     """
     stored = explanation.decision
     decision = stored.decision

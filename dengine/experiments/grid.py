@@ -298,7 +298,7 @@ def iterate_replays(
     SettingError
         A baseline that cannot be found or imported: this is raised after the kept replays were
         yielded, and before anything is played. A replay that cannot be played, see `replay`. With
-        `keep` also for a reducer that cannot be hashed.
+        `keep` also for a reducer that cannot be hashed or imported, before any replay is yielded.
     DataError
         A data set that cannot be read.
     StoreError
@@ -434,6 +434,7 @@ def grid_tasks(
     ------
     SettingError
         A recipe cannot be loaded, two have the same name and policy, or a setting is out of range.
+        Names and policies are compared as loaded, before `alphas` and the others replace settings.
     """
     seeds = list(seeds)
     names = ("interval", "alpha", "lower_bound")

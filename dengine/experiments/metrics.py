@@ -53,10 +53,11 @@ def pooled_error(replays: Sequence[Any], side: str = "accepted", alpha: float = 
 
     Thirty shuffles of one set play the same traces thirty times, so they are not thirty independent
     samples. The unit is therefore the trace: the variance of the share is estimated from the
-    differences between traces, by linearisation. The interval is Wilson's, for the number of
-    independent decisions that would have this variance. If the variance is 0, for example because
-    no decision or each was wrong, it is Wilson's for the number of different traces among these
-    decisions. The interval holds for other parts of the same kind, not for another cell.
+    differences between traces, by linearisation (the error of a ratio of two sums, to first order).
+    The interval is Wilson's, for the number of independent decisions that would have this variance.
+    If the variance is 0, for example because no decision or each was wrong, it is Wilson's for the
+    number of different traces among these decisions. The interval holds for other parts of the same
+    kind, not for another cell.
 
     Parameters
     ----------

@@ -1,9 +1,8 @@
 """Replays as tables: a row for each replay in the CSV, a pooled row for each recipe and policy on
 the screen, and sentences about them. `dengine replay` and `dengine compare` print them.
 
-    frame = frame_of(replays)
-    rows = pool(frame, replays)
-    Console().print(pooled_table(rows, "Replays", LEGEND), *promise_lines(rows))
+    frame = frame_of(replays) rows = pool(frame, replays) Console().print(pooled_table(rows,
+    "Replays", LEGEND), *promise_lines(rows))
 """
 
 from __future__ import annotations
@@ -92,7 +91,7 @@ def pool(frame: pd.DataFrame, replays: Sequence[Replay]) -> list[Row]:
           mean over the replays would weigh a replay that accepted three parts as much as one that
           accepted 300.
         - Times of retrains and decisions, the first certain cycle and savings: median, largest or
-          mean, as `AGGREGATED` says.
+          mean, as `AGGREGATED` says. Replays without such a value (NaN) are left out.
         - error_lower, error_upper : 95 % interval of the share of bad parts among the accepted
           parts; 0 and 1 if none was accepted.
         - promise_kept : whether the pooled precision is at least LB; None if fewer than 200 parts

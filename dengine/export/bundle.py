@@ -3,9 +3,9 @@
 checks and builds the module, `describe` and `write_export` write, `read_checked` and `metadata_of`
 read, and `make_key` makes the key that signs.
 
-    dengine export --make-key cell.key
-    dengine export engine.db --out model.ts --key cell.key  # model.ts, .ts.sha256, .ts.sig
-    python -c 'from dengine import load_exported; load_exported("model.ts", key="cell.key")'
+    dengine export --make-key cell.key dengine export engine.db --out model.ts --key cell.key  #
+    model.ts, .ts.sha256, .ts.sig python -c 'from dengine import load_exported;
+    load_exported("model.ts", key="cell.key")'
 
 The checksum guards against damage, not against an adversary: whoever can change the file can change
 the sum. The signature says who made the file before a byte of it is run. It is HMAC-SHA256 (FIPS
@@ -299,7 +299,7 @@ def write_export(
     OutputError
         If a file must not or cannot be written; files that were written before it stay.
     ExportError
-        If the key cannot be read.
+        If the key cannot be read, or has fewer than 16 bytes; nothing is written then.
     OSError
         If an old signature cannot be removed.
     """
@@ -337,8 +337,8 @@ def read_checked(path: Path, key: FilePath | None = None) -> bytes:
     ------
     ExportError
         If the file or its checksum is missing or unreadable, or the content does not have the sum
-        in PATH.sha256. With a key also if the key or the signature is missing or unreadable, or the
-        content was not signed with this key.
+        in PATH.sha256. With a key also if the key or the signature is missing or unreadable, the
+        key has fewer than 16 bytes, or the content was not signed with this key.
     """
     content = _read(path)
     expected = _first_word(_read(sibling_path(path, "sha256"), SUM_BYTES))

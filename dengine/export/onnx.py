@@ -126,7 +126,7 @@ def export_onnx(
 
 
 def load_onnx(path: FilePath, *, key: FilePath | None = None) -> "OnnxModel":
-    """Check an ONNX file, load it into onnxruntime on one thread, and decide once.
+    """Check an ONNX file, load it into onnxruntime on one thread, and decide once, to warm it up.
 
     Unlike `load_exported` it does not compare the embedding of a test trace with the file's.
 
@@ -144,9 +144,9 @@ def load_onnx(path: FilePath, *, key: FilePath | None = None) -> "OnnxModel":
     Raises
     ------
     ExportError
-        For a file that is missing, damaged or not signed with the key, a key that cannot be read, a
-        file that is no ONNX export, has another schema or is refused by onnxruntime, and if a
-        package for ONNX is missing.
+        For a file that is missing, damaged or not signed with the key, a key that cannot be read
+        or has fewer than 16 bytes, a file that is no ONNX export, has another schema or is refused
+        by onnxruntime, and if a package for ONNX is missing.
     """
     _require_packages()
     import onnx

@@ -2,8 +2,7 @@
 one insertion, by the physics of world.py and the conditions of conditions.py; `read_sensor` adds
 the faults of the force sensor. The label follows from the height of the part.
 
-    cell = SimulatedCell(seed=0)
-    for cycle in DataEngine().run(cell, cycles=600): ...
+    cell = SimulatedCell(seed=0) for cycle in DataEngine().run(cell, cycles=600): ...
 
 It runs as fast as the computer can; `SimulatedCell.clock` counts the seconds that production would
 take.
@@ -55,16 +54,17 @@ def read_sensor(
 ) -> TraceArray:
     """Return what the sensor reports of a true force.
 
-    The force passes a low-pass filter of first order, which starts at 0, gets the sensor's faults,
-    and is quantised. The drift grows linearly to its full value at the last sample. Then samples
-    are lost: a lost sample repeats the last sample that was not lost. The first is never lost.
-    `rng` is advanced.
+    The force passes a low-pass filter of first order, which starts at 0, gets noise, ripple (a
+    sine), bias and drift, and is rounded to multiples of the fault `step_n`. The drift grows
+    linearly to its full value at the last sample. Then samples are lost: a lost sample repeats the
+    last sample that was not lost. The first is never lost. `rng` is advanced.
 
     Parameters
     ----------
     force : array of float64, shape (samples,)
-        True force along z in newtons, at 500 Hz.
+        True force along z in newtons, at 500 Hz; at least 2 samples, or all become NaN.
     faults : SensorFaults
+        With a `step_n` of 0 all samples become NaN.
     parameters : CellParameters
         Only `bandwidth_hz` is used.
     rng : numpy.random.Generator
@@ -151,7 +151,8 @@ def insert_once(
     SettingError
         For a time step or sizes that cannot be simulated.
     ValueError
-        For ranges or probabilities, also of the sensor, that cannot be drawn from.
+        For ranges or probabilities, also of the sensor, that cannot be drawn from, and for a
+        negative seed or cycle.
     """
     world_rng, sensor_rng, _ = _make_generators(seed, cycle)
     conditions = draw_conditions(parameters, world_rng)
@@ -179,8 +180,8 @@ def _find_cause(conditions: Conditions, pushed: Push) -> str:
     a wrong part was drawn, that is the cause. Debris that was drawn is the cause if the part's tip
     stopped below the rim of the hole and its chamfer, at most `SLIP_MM` above the debris. Otherwise
     the cause is "slip" if the part moved more than `SLIP_MM` in the gripper, and else where its tip
-    stopped: "rim_contact" on the rim or its chamfer, "stuck" at most `STUCK_MM` above the seat,
-    "wedging" in between.
+    stopped: "rim_contact" on the rim or its chamfer, "stuck" at most `STUCK_MM` above the seat
+    (the floor of the hole), "wedging" in between.
     """
     tip_mm = pushed.height_mm - conditions.extra_length_mm  # of the part's tip above the seat
     if conditions.fault in ("missed_grasp", "wrong_part"):

@@ -56,6 +56,8 @@ def simulate(
         For an unknown scenario, n below 1, and a time step that does not divide 2 ms.
     DengineError
         If MuJoCo is not installed.
+    ValueError
+        For a negative seed, and for an `n_jobs` of 0.
     """
     from joblib import Parallel, delayed
 

@@ -53,8 +53,8 @@ class Push:
 def push(conditions: Conditions, time_step_s: float = TIME_STEP_S) -> Push:
     """Lower the gripper with the part into the fixture for 2 s; return what came of it.
 
-    The gripper goes down to a target below the seat, and moves back while the force is above its
-    limit. The force is recorded at 500 Hz. The simulation has no randomness.
+    The gripper goes down to a target below the seat (the floor of the hole), and moves back while
+    the force is above its limit. The force is recorded at 500 Hz. The simulation has no randomness.
 
     Parameters
     ----------
@@ -191,7 +191,9 @@ def _part_xml(c: Conditions) -> str:
     """Return the part of MuJoCo's model (MJCF, as text) that is the part in the gripper.
 
     It is "" if the grasp missed the part. Dry friction holds the part in the gripper until the
-    force of the push exceeds `c.grip_n` newtons; then it slides. `c` are the conditions.
+    force of the push exceeds `c.grip_n` newtons; then it slides, by at most about 12 mm up or down.
+    `c` are the conditions. `push` reads the joint "in_hand" and the site "top". Angles in the text
+    are in radians (see `_wall_xml`).
     """
     if c.fault == "missed_grasp":
         return ""
@@ -215,7 +217,8 @@ def _fixture_xml(c: Conditions) -> str:
     """Return the part of MuJoCo's model (MJCF, as text) that is the fixture.
 
     It has four walls with a chamfer of 45° around a square hole, a floor, and debris, a soft box on
-    the floor, only if its thickness in the conditions `c` is above 0.
+    the floor, only if its thickness in the conditions `c` is above 0. The rim is at z = 0. Angles
+    in the text are in radians (see `_wall_xml`).
     """
     half = (WIDTH_MM + c.clearance_mm) / 2000
     depth = DEPTH_MM / 1000

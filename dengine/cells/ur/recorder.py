@@ -155,7 +155,8 @@ class RtdeRecorder(AbstractContextManager["RtdeRecorder"]):
         Parameters
         ----------
         timeout : float, default 60
-            Seconds.
+            Seconds from the call to the end of the insertion. If the recorder is closed, only the
+            packages that were received before are read, and nothing is waited for.
 
         Returns
         -------
@@ -164,7 +165,7 @@ class RtdeRecorder(AbstractContextManager["RtdeRecorder"]):
         Raises
         ------
         CellError
-            If no insertion begins within `timeout`.
+            If no insertion begins within `timeout`, or before the recorder is closed.
         """
         for row in self.stream.rows(timeout):
             if (record := self.feed(row)) is not None:

@@ -153,7 +153,11 @@ class RtdeClient:
         return package.payload
 
     def _send(self, data: bytes) -> None:
-        """Send all of these bytes to the controller; raise CellError if the connection is lost."""
+        """Send all of these bytes to the controller.
+
+        Raise CellError if the connection is lost, or if this takes longer than the client's
+        `timeout`; some of the bytes may have been sent then.
+        """
         with instead(
             CellError,
             f"Expected {self.where} to take what it is sent, the connection is lost",
