@@ -1,7 +1,8 @@
 """`Corrections`: with it people correct a label, forget labels, go back to an earlier version and
 release it, or set another policy. The methods of `DataEngine` that do this call it.
 
-    engine.correct(decision.id, success=False, author="kim") engine.rollback(3)
+    engine.correct(decision.id, success=False, author="kim")
+    engine.rollback(3)
 
 Each change is an event that is kept for ever. Nothing is overwritten: a correction is a later row,
 an earlier version is put in force again as a new version, and a decision stays as it was decided.
@@ -189,9 +190,8 @@ class Corrections:
                 "Expected the ids of decisions to forget, got none; name at least one."
             )
         decisions = self._find_labelled(list(dict.fromkeys(decision_ids)))
-        labels = {
-            stored.decision.id: stored.success for stored in decisions if stored.success is not None
-        }
+        forgotten = [stored for stored in decisions if stored.success is not None]
+        labels = {stored.decision.id: stored.success for stored in forgotten}
         if not labels:
             ids = [stored.decision.id for stored in decisions]
             return self._as_unchanged("forget", f"{_labels_are(ids)} forgotten already")
@@ -200,7 +200,7 @@ class Corrections:
         data = {"decisions": changes, "reason": reason}
         live = self._live
         has_seen = live.trained_on.has_seen
-        if live.pinned and any(has_seen(stored.label_seq or 0) for stored in decisions):
+        if live.pinned and any(has_seen(stored.label_seq or 0) for stored in forgotten):
             text += f"; version {live.version}, which learned from this, is pinned no more"
             self._learner.release(author)
         return self._change_labels(Change("forget", text, data, author, tuple(labels), None))

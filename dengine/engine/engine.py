@@ -571,7 +571,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         The decision is made and recorded. With an id it must be on disk before the caller acts on
         it; if the disk does not take it, the decision becomes VERIFY. Without an id one is made.
         Checks that are overdue are counted. Raises what `DecisionMaker.convert` raises, before
-        anything else is done, and what `Learner.catch_up` raises, before the decision.
+        anything else is done.
         """
         x = self._maker.convert(trace)
         self._learner.catch_up()
@@ -620,7 +620,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
             learned. Also for an engine that is closed, was opened for reading or before a fork, or
             is in use by another thread.
         Exception
-            What a handed-in model raises that must be trained or fitted again; the label is on disk
+            What the copying of a handed-in model raises, before a retrain; the label is on disk
             then.
         """
         label = as_success(success)  # refused before anything is written

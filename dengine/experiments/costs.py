@@ -2,7 +2,8 @@
 user's own recordings. The subcommand `dengine costs` prints it.
 
     curve = cost_curve("insertion", check=5, escape=600, false_reject=30, recipe="pca", n_jobs=2)
-    print(curve.sentence) curve.policy, curve.to_frame()
+    print(curve.sentence)
+    curve.policy, curve.to_frame()
 
 A part's mean cost is check x verified + escape x (accepted and bad) + false_reject x (rejected and
 good), in one unit of the user's, over all parts of a replay, its beginning included. Verifying

@@ -1,8 +1,9 @@
 """Replays as tables: a row for each replay in the CSV, a pooled row for each recipe and policy on
 the screen, and sentences about them. `dengine replay` and `dengine compare` print them.
 
-    frame = frame_of(replays) rows = pool(frame, replays) Console().print(pooled_table(rows,
-    "Replays", LEGEND), *promise_lines(rows))
+    frame = frame_of(replays)
+    rows = pool(frame, replays)
+    Console().print(pooled_table(rows, "Replays", LEGEND), *promise_lines(rows))
 """
 
 from __future__ import annotations

@@ -3,9 +3,9 @@
 checks and builds the module, `describe` and `write_export` write, `read_checked` and `metadata_of`
 read, and `make_key` makes the key that signs.
 
-    dengine export --make-key cell.key dengine export engine.db --out model.ts --key cell.key  #
-    model.ts, .ts.sha256, .ts.sig python -c 'from dengine import load_exported;
-    load_exported("model.ts", key="cell.key")'
+    dengine export --make-key cell.key
+    dengine export engine.db --out model.ts --key cell.key  # model.ts, .ts.sha256, .ts.sig
+    python -c 'from dengine import load_exported; load_exported("model.ts", key="cell.key")'
 
 The checksum guards against damage, not against an adversary: whoever can change the file can change
 the sum. The signature says who made the file before a byte of it is run. It is HMAC-SHA256 (FIPS

@@ -2,7 +2,8 @@
 one insertion, by the physics of world.py and the conditions of conditions.py; `read_sensor` adds
 the faults of the force sensor. The label follows from the height of the part.
 
-    cell = SimulatedCell(seed=0) for cycle in DataEngine().run(cell, cycles=600): ...
+    cell = SimulatedCell(seed=0)
+    for cycle in DataEngine().run(cell, cycles=600): ...
 
 It runs as fast as the computer can; `SimulatedCell.clock` counts the seconds that production would
 take.

@@ -186,7 +186,9 @@ class RtdeClient:
                 raise CellError(f"Expected packages from {self.where}, {reason}{self._last_text}.")
             for package in packages.feed(piece):
                 if package.type is PackageType.TEXT:
-                    text = package.payload[1 : 1 + package.payload[0]].decode("utf-8", "replace")
+                    text = package.payload[1 : 1 + int.from_bytes(package.payload[:1])].decode(
+                        "utf-8", "replace"
+                    )
                     self._last_text = f' (it said: "{text[:200]}")'
                 else:
                     yield package
