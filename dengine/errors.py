@@ -47,10 +47,11 @@ def without_password(text: str) -> str:
 def shortened(value: Any) -> str:
     """Return the `repr` of a value for a message.
 
-    If it is longer than 60 characters, "..." stands for its middle. A container shows only its
-    first items (six of a list or tuple, four of a dict), each of them cut like this.
+    In a text the passwords of database URLs are masked first. If it is longer than 60 characters,
+    "..." stands for its middle. A container shows only its first items (six of a list or tuple,
+    four of a dict), each of them cut like this.
     """
-    return _REPR.repr(value)
+    return _REPR.repr(without_password(value) if isinstance(value, str) else value)
 
 
 def listed(names: Iterable[Any]) -> str:

@@ -526,8 +526,8 @@ class ModelPrediction(EngineModel):
         Returns
         -------
         Decider
-            Compiled if encoder and rule can be compiled. Otherwise it runs in Python, and only some
-            of its submodules are compiled.
+            Compiled if the reducer has a module (`Reducer.module`) and the rule is `scriptable`.
+            Otherwise it runs in Python, and only some of its submodules are compiled.
 
         Raises
         ------
@@ -536,7 +536,8 @@ class ModelPrediction(EngineModel):
         SettingError
             If the force limits do not fit the traces.
         RuntimeError, torch.jit.Error, FrontendError, OSError
-            If TorchScript cannot compile or run the reducer's module, see `script`.
+            If TorchScript cannot compile or run the reducer's module or a `scriptable` rule, see
+            `script`. There is no way back to Python then.
         """
         encoder = self.spaces.module()
         if encoder is not None and self.rule.scriptable:
@@ -588,9 +589,9 @@ class ModelPrediction(EngineModel):
         `y` is 1 for success, 0 for failure. The hash of the trace's content gives the fold and
         stands for the part. The reducer is not trained, and a full index drops its oldest
         reference. Samples are not checked: a NaN makes a reference of NaN. Returns self. Raises
-        ValueError if nothing was fitted, TraceError for a trace of another shape (another length is
-        fitted as `trace_spec.fit` says, if it can be), and ReportError for another label; also what
-        `build_decider` raises, if no decider is kept.
+        ValueError if nothing was fitted, TraceError for a trace of another shape or length, or not
+        of real numbers, and ReportError for another label; also what `build_decider` raises, if no
+        decider is kept.
         """
         X = as_traces(np.asarray(x)[None], self.trace_spec)
         hash_ = int(content_hash(X)[0])
@@ -817,7 +818,8 @@ class ModelPrediction(EngineModel):
         map `examples` to the same points within 1e-5 (`is_close`), twice in a row; if a reducer
         gives no state, it must do so itself. The points, divided by the scale of their embedding
         space, are kept for `check_answers`, unless a reference is not finite. If restoring raises a
-        StoreError, that is a defect; other errors are raised.
+        StoreError, that is a defect; other errors are raised. Call it right after a training: a
+        restored model has no `examples`, and some reducers raise TraceError then.
         """
         if not np.isfinite(self.index.column("points")).all():
             return "the embedding of a reference is not finite"

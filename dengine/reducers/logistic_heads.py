@@ -98,8 +98,10 @@ class RidgeProblem:
         """Return the lower Cholesky factor of the Hessian of classifier head k.
 
         The factor is float64 (W + 1, W + 1), for W features and the bias. The head is a logistic
-        regression, whose Hessian depends on `p` (n,), the probabilities that head k gives. The
-        product of features is computed in float32, since a Newton step may be inexact.
+        regression, whose Hessian depends on `p` (n,), the probabilities that head k gives. It
+        covers the rows that train the head, and has the ridge on its diagonal. The product of
+        features is computed in float32, since a Newton step may be inexact. Raises
+        torch.linalg.LinAlgError if the sum is not positive definite, for example if it has a NaN.
         """
         curvature = (self.mask[k] * p * (1.0 - p)).float()
         product = (self.g32 * curvature[:, None]).T @ self.g32  # a step need not be exact

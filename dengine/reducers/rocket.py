@@ -343,9 +343,10 @@ class RocketReducer(ProbabilityReducer):
     def _initialize(self, traces: Floats) -> None:
         """Build the module `net_`, with kernels and the channels' scales from traces (n, C, T).
 
-        A channel is scaled so that its samples have the standard deviation 1. The classifier heads
-        are 0. No label is read. Earlier fits are discarded. Raises SettingError for a parameter out
-        of its range or fewer than 2 samples.
+        A channel is scaled so that its samples have the mean 0 and the standard deviation 1 in at
+        most 256 of the traces; one that never moves is only shifted. The classifier heads are 0. No
+        label is read. Earlier fits are discarded. Raises SettingError for a parameter out of its
+        range or fewer than 2 samples.
         """
         x = torch.from_numpy(traces)
         self.build(traces.shape[1], traces.shape[2], averaging(x))
@@ -517,10 +518,11 @@ class RocketReducer(ProbabilityReducer):
     def _set_axes(self, f: Tensor) -> None:
         """Write the leading components of the first `Tower`, and the second coordinate, to `net_`.
 
-        The leading components are the ones whose products are features of the last tower. If there
-        is a second coordinate, it is a sigmoid of the first component. Before the sigmoid the
-        component is scaled to mean 0 and standard deviation 2 over the tower's features `f` (n, p).
-        Its sign is changed if it would point against the second coordinate that `net_` had before.
+        The leading components are the first four, or fewer if there are not so many. The products
+        of every two of them are the features of the last tower. If there is a second coordinate, it
+        is a sigmoid of the first component. Before the sigmoid the component is scaled to mean 0
+        and standard deviation 2 over the tower's features `f` (n, p). Its sign is changed if it
+        would point against the second coordinate that `net_` had before.
         """
         net = self.net_
         columns = net.encoder.towers[0]
@@ -613,10 +615,10 @@ class RocketReducer(ProbabilityReducer):
         """Restore what `get_state` returned, and return self; the parameters must be the same.
 
         Afterwards the cache of features is empty. Raises SettingError for a parameter out of its
-        range, StoreError if an array of `net_` is missing or the sizes do not follow from the
-        parameters, ValueError if a `Tower` lacks an array, and KeyError if the shape, the counters
-        (of fits, traces and steps) or the losses (log loss of each space) are missing. After an
-        error the fitted model is lost.
+        range, StoreError if an array of `net_` is missing or has a size that does not follow from
+        the parameters, ValueError if a `Tower` lacks an array, and KeyError if the shape, the
+        counters (of fits, traces and steps) or the losses (log loss of each space) are missing. The
+        sizes of a tower's arrays are not checked. After an error the fitted model is lost.
         """
         channels, samples = self.restore_shape(state)
         average, *counts = map(int, state["counts"])
@@ -658,9 +660,9 @@ def sample_rows(n: int, numbers: Ints | None) -> Ints | slice:
     They are int64 (4000,), increasing. If there are no more rows than that, the result is instead
     ``slice(None)``, which selects all. The same arguments give the same rows.
 
-    A hash of the labels' numbers (n,) draws them, evenly in time. So most rows are those of the
-    last fit, and the heads start near their final weights. If `numbers` is None, they are 0 to
-    n - 1.
+    A hash of the labels' numbers (n,) draws them, old and new labels alike. So most rows are those
+    of the last fit, and the heads start near their final weights. If `numbers` is None, they are 0
+    to n - 1.
     """
     if n <= MAX_TRAINING_TRACES:
         return slice(None)

@@ -261,8 +261,9 @@ class TorchReducer(ProbabilityReducer):
         checkpoint, makes `encoder_`, the module that embeds, and sets `is_initialized_` to True.
         `average` is the number of samples that are averaged to one. Without `seed` the seed comes
         from `random_state`; torch's global generator keeps its state. Raises SettingError for a
-        parameter out of its range, fewer than 2 samples, or a network that `Members` refuses, like
-        one that does not give (B, features); of these only the last changes anything.
+        parameter out of its range, fewer than 2 samples, a `random_state` of another type, or a
+        network that `Members` refuses, like one that does not give (B, features). The first two
+        change nothing; after the others do not use the reducer.
         """
         self.check()
         if samples < 2:
@@ -473,7 +474,7 @@ class TorchReducer(ProbabilityReducer):
         It is the present `encoder_`, which later trainings replace and do not change. None if
         TorchScript cannot compile the network: the first call finds this out, and logs a warning,
         unless a warning for this network and shape was logged before (`compile_fault`). Raises
-        NotFittedError before a fit.
+        NotFittedError before a fit, and TypeError if `network` is not hashable.
         """
         check_is_fitted(self, "encoder_")
         shape = self.preprocessor_.channels, self.preprocessor_.samples
@@ -525,10 +526,11 @@ class TorchReducer(ProbabilityReducer):
 
         The constructor's parameters must be the same. A tensor that the state lacks keeps its
         initial value, since earlier releases stored fewer. Raises StoreError if the sizes are
-        others, or if the network gives points for a fixed trace that differ by more than 0.001 from
-        those when the state was taken; a state without these points is not checked so. Raises
-        KeyError if an array of counts, shape or loss is missing, and SettingError for a parameter
-        or network that cannot be used. After an error do not use the reducer.
+        others, if the state has a tensor that the modules lack, or if the network gives points for
+        a fixed trace that differ by more than 0.001 from those when the state was taken; a state
+        without these points is not checked so. Raises KeyError if an array of counts, shape or loss
+        is missing, and SettingError for a parameter or network that cannot be used. The sizes of
+        the optimiser's tensors are not checked. After an error do not use the reducer.
         """
         channels, samples = self.restore_shape(state)
         average, seed, *counts = map(int, state["counts"])
@@ -616,8 +618,8 @@ def draw_batches(
     folds : array of int, shape (n,)
         Network k gets no row of fold k.
     n_folds, batch_size, steps : int
-        K, B and the number of batches. If a network has fewer than B rows, B is reduced to the
-        smallest number of rows of a network.
+        K, B and the number of batches, which is at least 1. If a network has fewer than B rows, B
+        is reduced to the smallest number of rows of a network.
     rng : numpy.random.Generator
 
     Yields

@@ -496,9 +496,10 @@ class UmapReducer(Reducer):
     def get_state(self) -> State:
         """Return arrays from which `set_state` restores the reducer bit for bit, by name.
 
-        They are shape and counters, and the numbers (of the labels), frames, neighbours, distances
-        and points of the last training. Not all of them are copies. Neighbours that `precompute`
-        found are not among them. Raises NotFittedError before a fit.
+        They are the shape of the traces, the centre and scale of `Frames`, the seed, the counts of
+        frames and epochs, and of the last training the numbers (of the labels), frames, neighbours,
+        distances and points. Not all of them are copies. Neighbours that `precompute` found are not
+        among them. Raises NotFittedError before a fit.
         """
         check_is_fitted(self, "encoder_")
         counts = [self.make_frames_.n_frames, self.seed_]
@@ -536,6 +537,9 @@ class UmapReducer(Reducer):
 
     def _check(self, X: ArrayLike, reset: bool) -> Floats:
         """Check traces and parameters, and return the traces as `check_traces` does.
+
+        With `reset` the traces set the shape that later ones must have, even if a parameter is
+        refused.
 
         Raises SettingError for a parameter out of its range, or too few traces, and the errors of
         `check_traces`. n_components must be an integer from 1 to 100, n_neighbors from 2 to 1000,

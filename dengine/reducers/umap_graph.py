@@ -263,8 +263,8 @@ def membership_strengths(distances: Tensor, n_neighbors: int) -> Tensor:
     to ``log2(n_neighbors)``, but it is at least 0.001 of the mean distance to the neighbours, with
     the trace itself at 0 (over all traces, if rho is 0 because all neighbours are identical); the
     sum is also larger if many neighbours are as near as rho. The method is that of
-    `smooth_knn_dist` and `compute_membership_strengths` in umap-learn, with a local connectivity of
-    1.
+    `smooth_knn_dist` and `compute_membership_strengths` in umap-learn, with 1 for its parameter
+    `local_connectivity`.
 
     Parameters
     ----------

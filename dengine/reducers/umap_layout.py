@@ -144,7 +144,8 @@ def find_ab_params(min_dist: float) -> tuple[float, float]:
 
     References
     ----------
-    Definition 11 of McInnes et al. (2018); the grid is that of umap-learn's `find_ab_params`.
+    Definition 11 of McInnes et al. (2018). The curve is fitted at the 300 distances from 0 to 3 of
+    umap-learn's `find_ab_params`.
     """
     distance = np.linspace(0.0, 3.0, 300)
     strength = np.where(distance < min_dist, 1.0, np.exp(-(distance - min_dist)))
@@ -210,8 +211,7 @@ def attraction(points: Tensor, edges: Edges, a: float, b: float) -> tuple[Tensor
     An edge pulls with the coefficient ``4 a b d^(2b - 2) / (1 + a d^(2b))`` times its strength,
     along the offset to the neighbour. Here d is the distance between the two, and d^2 counts as
     1e-8 at least. This is the negative gradient of the edge's term in the cross entropy, twice. The
-    factor is 4, not 2, since umap-learn moves both ends of an
-    edge and holds each edge twice.
+    factor is 4, not 2, since umap-learn moves both ends of an edge and holds each edge twice.
 
     Parameters
     ----------

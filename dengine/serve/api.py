@@ -439,8 +439,8 @@ def _error_response(request: Request, error: Any) -> Response:
     An HTTPException has a status, a text and headers of its own; but for the statuses 404 and 405,
     which only starlette raises, dengine has its own text. For other errors the status is the one
     that `STATUSES` has for their type, with the error's text, in which Python's arguments are
-    written as options. Any other exception gets 500 with a general text, and is logged with its
-    traceback.
+    written as options (`as_options`: `rate_hz=500` becomes `--rate-hz 500`). Any other exception
+    gets 500 with a general text, and is logged with its traceback.
     """
     if isinstance(error, HTTPException):
         detail = NO_ROUTE.get(error.status_code, error.detail)

@@ -152,9 +152,9 @@ def names_this_machine(host: str) -> bool:
     """Return whether a request's `Host` header is localhost or a loopback address, with or without
     a port, in small or capital letters.
 
-    It is False for "" and for brackets without an address; what stands behind the colon, and before
-    an `@`, is not checked. It is False as well for a web page of another site whose name was made
-    to resolve to this machine (DNS rebinding): the browser sends that name as `Host`.
+    It is False for "" and for brackets without an address; what stands before an `@`, and behind a
+    colon, `/`, `?` or `#`, is not checked. It is False as well for a web page of another site whose
+    name was made to resolve to this machine (DNS rebinding): the browser sends that name as `Host`.
     """
     try:
         return is_loopback(urlsplit(f"//{host}").hostname or "")
@@ -269,9 +269,9 @@ class Guard:
         or by a loopback address (421); `_check_token` checks the token (401, 403; /healthz needs
         none), and sets the context variable `CURRENT_TOKEN` to it, or to `ANYBODY` on a server
         without tokens; a request that may change something (not GET, HEAD or OPTIONS) must not come
-        from a web page of another site, by its headers Origin and Sec-Fetch-Site (403); and the
-        announced length of the body must be at most `MAX_BODY` (413), 1 MiB. A token in the path is
-        removed from `scope`.
+        from a web page of another host or port, by its headers Origin and Sec-Fetch-Site (403); and
+        the announced length of the body must be at most `MAX_BODY` (413), 1 MiB. A token in the
+        path (/RPC2/TOKEN) is removed from `scope`.
         """
         headers = Headers(scope=scope)
         host = headers.get("host", "")

@@ -243,8 +243,8 @@ class HttpApi:
         forgotten outcome of a certain decision, as wrong. In the reason each run of white space
         becomes a space. If a rollback pinned the version in force, and this was trained with one of
         the labels, it is released, so that retrains may replace it. A training under way begins
-        again, even if the labels are forgotten already. 503: the queue is full, the store does not
-        answer, or the trace of a decision is damaged.
+        again, even if the labels are forgotten already; no event is recorded then. 503: the queue
+        is full, the store does not answer, or the trace of a decision is damaged.
         """
         line = " ".join(reason.split())
         return await self._change(
@@ -323,8 +323,8 @@ class HttpApi:
     ) -> Json:
         """Return how the cell is doing: counts of decisions, version, faults, queue and alarm.
 
-        The counts are of all decisions, and of the newest 500. 503: the queue is full, or the store
-        cannot be read.
+        The counts are of all decisions, and of the newest 500. 422: the stored recipe cannot be
+        read; 503: the queue is full, or the store cannot be read.
         """
         status = await self.service.status(watch)
         line = {name: getattr(self.service, name) for name in api.LINE}

@@ -237,12 +237,15 @@ class AddressSpace:
         a new id; `part` is the part's number, "" for none. The same request id and trace get the
         same decision again.
 
-        If the queue is full, or the service or its engine is closed, the result is VERIFY with an
-        empty id, the reason "busy", the bounds 0 and 1, and version 0. Raises TraceError if the
-        trace is empty, if `channels` is below 1 or the trace's length no multiple of it, for a
-        trace or part that the engine does not take, and for an id of another trace. Raises
-        ReportError for an invalid id, and SettingError for a first trace that the settings do not
-        allow.
+        After the service's deadline, or if the store fails, a new decision is VERIFY with the
+        reason "late" or "no_store", which may not be recorded. If the queue is full, or the service
+        or its engine is closed, nothing is recorded, and the result is VERIFY with an empty id, the
+        reason "busy", the bounds 0 and 1, and version 0.
+
+        Raises TraceError if the trace is empty, if `channels` is below 1 or the trace's length no
+        multiple of it, for a trace or part that the engine does not take, and for an id of another
+        trace. Raises ReportError for an invalid id, and SettingError for a first trace that the
+        settings do not allow.
         """
         if channels < 1 or len(trace) % channels or not trace:
             raise TraceError(

@@ -228,10 +228,10 @@ class RobotCalls:
 
         If the id already has a decision, it is returned again. Otherwise the call waits up to
         `RECORD_SECONDS` for the recording. Only the part of the newest `begin` has a recording, and
-        only for one call, even if that call times out or is refused. If there is no recording, or
-        the recorder fails, which is logged, the result is verify with an id "" and the reason
-        "not_recorded", and nothing is stored. An insertion that is incomplete after this time has
-        NaN for its missing samples, so it is verified and stored with that fault.
+        only for one call, even if that call times out, is refused or gets "busy". If there is no
+        recording, or the recorder fails, which is logged, the result is verify with an id "" and
+        the reason "not_recorded", and nothing is stored. An insertion that is incomplete after this
+        time has NaN for its missing samples, so it is verified and stored with that fault.
 
         Parameters
         ----------

@@ -218,8 +218,8 @@ class CellService:
         Raises
         ------
         TraceError
-            For a wrong shape, a first trace of less than 10 samples, an invalid part number, or an
-            id that belongs to another trace.
+            For a wrong shape, values that are no real numbers, a first trace of less than 10
+            samples, an invalid part number, or an id that belongs to another trace.
         SettingError
             For a first trace that the policy's force limits do not fit, or whose `TraceSpec`
             contradicts that of another cell of the product.
@@ -419,7 +419,8 @@ class CellService:
         """Yield True at once, and then whenever something has changed since the last yield.
 
         A change is each call of the engine that is not read-only, even if it raised, and each
-        retrain that has ended. After `quiet` seconds without a change False is yielded. The
+        retrain that has ended between two calls. What a read-only call changes, like the retrain
+        that `read` may do, is none. After `quiet` seconds without a change False is yielded. The
         iteration ends when `end_listening` is called, and yields nothing if it was called before.
         """
         event = asyncio.Event()

@@ -75,10 +75,11 @@ async def call_method(calls: RobotCalls, body: bytes) -> bytes:
     """Call the method that an XML-RPC request names, and return its value or a fault as XML.
 
     `calls` has the methods, of which those in `CALLS` may be called, and `body` is the request,
-    which is parsed in another thread. It raises nothing: everything becomes a fault with one line
-    of text and a code: a body that cannot be read (-32700), an unknown method (-32601), a wrong
-    number of arguments (-32602), a ReportError (2), another DengineError (1), and any other error
-    of the method (-32603), or a value that XML-RPC cannot carry. The last two are logged.
+    which is parsed in another thread. It raises nothing: every error becomes a fault with one line
+    of text and a code. The codes are -32700 for a body that cannot be read, -32601 for an unknown
+    method, -32602 for a wrong number of arguments, 2 for a ReportError, and 1 for another
+    DengineError. Any other error of the method, and a value that XML-RPC cannot carry, have -32603;
+    only these two are logged.
     """
     try:
         name, arguments = await asyncio.to_thread(parse_call, body)

@@ -81,8 +81,10 @@ def backup_store(url: FilePath, out: FilePath) -> BackupReport:
         file cannot be read, or if the records cannot be written to the copy.
     OutputError
         If `out` exists, or the `-wal` file of an earlier store beside it, or if `out` cannot be
-        written, for example on a full disk. Also if SQLite finds
-        damage in the store while it copies it or counts the rows of the copy.
+        written, for example on a full disk. Also if SQLite finds damage in the store while it
+        copies it or counts the rows of the copy.
+    OSError
+        If the disk fails while the records of a journal are read.
     """
     log_file = f"{os.fspath(out)}-wal"  # SQLite would take its rows for the copy's
     expect(not Path(log_file).exists(), f"no {log_file}", "one", "move it away", OutputError)
@@ -171,9 +173,11 @@ def restore_store(copy: FilePath, store: FilePath) -> tuple[CellHistory, ...]:
 def _add_records(file: Path, cell: str, records: list[Record]) -> None:
     """Commit records of a cell's journal to `file`, the copy; it is not opened for no records.
 
-    Records that the copy already has change nothing. A record that contradicts the copy is stored
-    there as an event of kind "dead letter". Raise StoreError if the cell's ledger has another key
-    or the copy cannot be written.
+    Records that the copy already has change nothing. A record that contradicts the copy, or that
+    its database refuses, is stored there as an event of kind "dead letter", and logged. Raise
+    StoreError if the cell's ledger has another key than the file that DENGINE_LEDGER_KEY names, if
+    that file cannot be read, or if the copy cannot be written; records that were committed before
+    stay.
     """
     if not records:
         return

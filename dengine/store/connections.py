@@ -344,12 +344,13 @@ class Database:
     def _open(self, product: str | None) -> Scope:
         """Create the tables or check them, add the cell to them if it is new, set `newest_entry`.
 
-        `newest_entry` becomes number and digest of the cell's newest ledger entry. A new cell gets
-        `product`, and its ledger begins with the key in the file that DENGINE_LEDGER_KEY names.
-        Return the cell with its product; it has none if neither the store nor `product` names one.
-        Raise StoreError, and disconnect, if the database cannot be opened or is no store of this
-        schema, if the ledger of the cell was begun with another key, and if `join_product` refuses
-        the product, for example for a cell that has another one.
+        Columns that an older store lacks are added. `newest_entry` becomes number and digest of the
+        cell's newest ledger entry. A new cell gets `product`, and its ledger begins with the key in
+        the file that DENGINE_LEDGER_KEY names. Return the cell with its product; it has none if
+        neither the store nor `product` names one. Raise StoreError, and disconnect, if the database
+        cannot be opened or is no store of this schema, if the ledger of the cell was begun with
+        another key, and if `join_product` refuses the product, for example for a cell that has
+        another one.
         """
         try:
             with _store_errors("open", self.name), self._engine.connect() as plain:
@@ -458,7 +459,8 @@ class Database:
         other cells of its product. Of the labels only the newest are checked. The rest is checked
         in full, except for the arrays of the versions; of each ledger itself only the newest entry.
         A ledger with another key than the one with which the store was opened counts as a
-        difference, too.
+        difference, too. The records that wait in the outbox are written first, if the database
+        takes them in time.
 
         Parameters
         ----------

@@ -91,7 +91,7 @@ class CorrectionTable(CellTable):
         """Return the label of each of these decisions, by id, as corrected by now.
 
         It is True for success, False for failure, and None if it was forgotten. Raise ReportError
-        for a decision that is unknown or has no label.
+        for a decision that is not this cell's, is unknown, or has no label.
         """
         stored = self.stored_labels(connection, ids)
         values = {0: False, 1: True, FORGOTTEN: None}
