@@ -96,7 +96,8 @@ def export_torchscript(
 
     The file does not know of a part that the engine accepted and whose outcome is not known yet, so
     it never learns this outcome. Export when no part is under way; this is not checked. The export
-    of an engine is recorded as an event in its store.
+    of an engine is recorded as an event in its store, before the file is written. A damaged trace
+    among those that are compared is left out, and an event is written, too.
 
     Parameters
     ----------
@@ -111,7 +112,8 @@ def export_torchscript(
     key : path-like, optional
         File of a key (`make_key`); the signature is written beside the file, as PATH.sig.
     force : bool, default False
-        Whether to replace an existing file; never a database, a folder or a link.
+        Whether to replace an existing file; never a database, a folder or a link. Without a key,
+        the signature of a replaced file is removed.
 
     Returns
     -------
@@ -125,7 +127,7 @@ def export_torchscript(
         traces, if the reducer, the interval or the decision rule cannot be compiled, if the
         compiled decision and the reducer map one of up to eight labelled traces to different
         points, if the rule is stale, because an update of it failed, if the store was changed from
-        outside, and if the key cannot be read.
+        outside, and if the key cannot be read or has fewer than 16 bytes.
     SettingError
         If the engine's force limits do not fit `trace`.
     OutputError

@@ -93,8 +93,9 @@ def part_map(store: "SqlStore", recipe: Recipe, version: int) -> PartMap:
         are as the version had them, or as they were reported later; a later correction does not
         show. There are none if no such version was put in force, if its state is damaged or no
         longer kept, or if it has no references (a baseline or a handed-in model). The newest parts
-        are those of the cell's newest 10 decisions that this version made and for which it embedded
-        the trace, with corrected labels. A part that is both appears once, as a newest part.
+        come from the cell's newest 10 decisions, of any version: those that this version made and
+        whose trace it embedded, with corrected labels. A part that is both appears once, as a
+        newest part.
 
     Raises
     ------

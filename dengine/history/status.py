@@ -452,8 +452,8 @@ def _count_span(tally: Tally, retrains: list[StoredVersion], policy: Policy) -> 
     Without decisions no retrain counts. A `Tally` holds how many decisions have each combination of
     properties, like action and reason; `retrains` are all retrains of the cell. The intervals of
     `would_accept` and `would_reject` (how often the model would have been wrong) are at 95 %,
-    whatever the policy's alpha, and their basis is "audits", or "checks" if the policy of now has
-    no audit rate.
+    whatever the policy's alpha. Their basis is "audits", or "checks" if the policy of now has no
+    audit rate, or "" if no outcome is known.
     """
     outcomes = tally.outcomes
     first = tally.first
@@ -583,12 +583,14 @@ def read_watch(store: SqlStore, recipe: Recipe, mode: Event | None) -> Watch | N
     """Return how close the drift detectors are to an alarm, and a safe mode to its end.
 
     They are read from the rule that `load_rule` returns. None if that is None, and if the rule has
-    no drift detectors: "local" with stops="some", and a user's rule. The values `accepts`,
-    `rejects` and `novelty` grow from 0 to 1, the alarm. In a safe mode that novel traces began, all
-    three are 0. The text `recovery` says how many parts since the alarm (10,001 are counted at
-    most) count as evidence, how many of these were decided wrongly, and after about how many more
-    parts the safe mode ends; or that the evidence is enough, or that it does not end, if these are
-    more than 10,000. It is "" outside safe mode. `mode` is the newest event at which a safe mode
+    no drift detectors: "local" with stops="some", and a user's rule that is no `MemberRule`. The
+    values `accepts`, `rejects` and `novelty` grow from 0 to 1, the alarm. In a safe mode that novel
+    traces began, all three are 0.
+
+    The text `recovery` says how many parts since the alarm (10,001 are counted at most) count as
+    evidence, how many of these were decided wrongly, and after about how many more parts the safe
+    mode ends; or that the evidence is enough, or that it does not end, if it would take more than
+    10,000 more parts. It is "" outside safe mode. `mode` is the newest event at which a safe mode
     began or ended; without it `recovery` is "". Raises what `load_rule` raises, and may write an
     event to the store as it does.
     """

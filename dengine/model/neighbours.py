@@ -346,7 +346,8 @@ class ModelPrediction(EngineModel):
 
         Reducer, radius, folds, novelty, policy and decision rule are the recipe's; `recipe.window`
         is the largest number of references. The class of a user is imported. Raises SettingError if
-        the reducer or the rule cannot be made.
+        the reducer or the rule cannot be made; other errors of the constructor of a user's class
+        are raised as they are.
         """
         policy = recipe.policy
         classifier = WilsonRadiusClassifier(
@@ -474,11 +475,12 @@ class ModelPrediction(EngineModel):
     def precompute(self, X: Floats, numbers: Ints | None = None) -> None:
         """Let the reducer compute in advance what a training on these traces (n, C, T) begins with.
 
-        `numbers` are the labels' sequence numbers, by which the reducer finds its results again.
-        Extreme samples are clipped first. Before the first training, if reducer and decision rule
-        can be compiled, a decider without references is compiled as well, because the first retrain
-        has no time for that; the process keeps it as a template (`template_of`). Raises what
-        `template_of` and the reducer raise.
+        `numbers` are the labels' sequence numbers, by which the reducer finds its results again;
+        without them a reducer of dengine keeps none. Samples far larger than usual are clipped
+        first (`clip_extremes`). Before the first training, if reducer and decision rule can be
+        compiled, a decider without references is compiled as well, because the first retrain has no
+        time for that; the process keeps it as a template (`template_of`). Raises what `template_of`
+        and the reducer raise.
         """
         X = clip_extremes(X)
         encoder = self.spaces.untrained_module(X)
