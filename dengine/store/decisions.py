@@ -241,8 +241,8 @@ class DecisionTable(CellTable):
         """Count the cell's decisions in groups.
 
         The decisions of a group are equal in action, in the action that the model alone would have
-        taken, reason, audit, quarantine, corrected label, the label's source, and whether a check
-        of that age would be overdue.
+        taken, reason, audit, quarantine, corrected label, the label's source, and whether they
+        are so old that a check without a label would be overdue (whatever their action).
 
         Parameters
         ----------
@@ -259,6 +259,11 @@ class DecisionTable(CellTable):
         Tally
             The groups, in no order, with the number of decisions in each; the smallest and the
             largest time of these decisions, None without any.
+
+        Raises
+        ------
+        StoreError
+            For a stored value that cannot be read.
         """
         newest = n_decisions(self._database.cell_id)
         aged = (sa.false() if within is None else newest - DECISION.c.number >= within).label(

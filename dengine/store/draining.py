@@ -140,8 +140,10 @@ class Drainer:
         """Return (decision id, label number) of each label that was drained since the last call.
 
         To drain a label is to copy it from the journal to the database. The pairs are in the order
-        in which this was done. A report that repeats a stored label has the number of that label. A
-        label that became a dead letter has no pair. Without a product the list is empty.
+        in which this was done. A report that repeats a stored label has the number of that label,
+        and a late stop that of the label that it corrects. A label that became a dead letter has no
+        pair, nor has one that an earlier process left in the journal. Without a product the list is
+        empty.
         """
         with self._changed:
             numbers = self._label_numbers
@@ -228,10 +230,11 @@ class Drainer:
         """Copy the records on the journal's disk to the database, and make submitted calls.
 
         The thread runs this until `stop` is called. Before a call all of these records are copied;
-        if this fails, the call is made nevertheless. Any error of the copying is logged, only the
-        first until it succeeds again, and kept for `fault`; the database is tried again a second
-        later, or sooner if there is a call. Once stopped, it ends when all submitted calls are
-        made, and the records are copied or the copying has failed.
+        if this fails, the call is made nevertheless. Any error of the copying is kept for `fault`,
+        until it succeeds again. It is logged only if none is kept there yet, and no timeout of
+        `drain`. The database is tried again a second later, or sooner if there is a call.
+        Once stopped, it ends when all submitted calls are made, and the records are copied or the
+        copying has failed.
         """
         while True:
             call = self._wait_for_work()

@@ -86,6 +86,11 @@ class EventTable(CellTable):
         Returns
         -------
         list of Event
+
+        Raises
+        ------
+        StoreError
+            For a stored value that cannot be read.
         """
         query = (
             sa.select(EVENT).where(self._own(EVENT)).order_by(EVENT.c.number.desc()).limit(limit)

@@ -47,14 +47,15 @@ class RecordInsertion:
 
         A record that is stored already changes nothing, except that a label has its pair. A record
         that contradicts the store, like another label of a labelled decision, or a label whose
-        decision is not stored, becomes a dead letter: an event that says what was in it, and that
-        is logged. A late stop (`_is_late_stop`) corrects the label of its part to failure, with an
-        event, and has its pair. A late stop of a label that was forgotten is a dead letter; if the
-        label counts as a failure already, the late stop changes nothing. A label of a quarantined
-        trace is quarantined. If the database refuses a value, the records are halved, each half in
-        a transaction of its own, until the refused record is alone; it becomes a dead letter, too.
-        A label that became a dead letter has no pair. Raise StoreError if the database fails in
-        another way; halves that were committed before stay.
+        decision is not stored, becomes a dead letter: an event that names it and says why (its
+        trace and other values are not in it), and that is logged. A late stop (`_is_late_stop`)
+        corrects the label of its part to failure, with an event, and has its pair. A late stop of a
+        label that was forgotten is a dead letter; if the label counts as a failure already, the
+        late stop changes nothing. A label of a quarantined trace is quarantined. If the database
+        refuses a value, the records are halved, each half in a transaction of its own, until the
+        refused record is alone; it becomes a dead letter, too. A label that became a dead letter
+        has no pair. Raise StoreError if the database fails in another way; halves that were
+        committed before stay.
         """
         try:
             return self._database.write(lambda connection: self._insert(connection, records))
@@ -79,8 +80,9 @@ class RecordInsertion:
         already; if the label was forgotten, the line stop becomes a dead letter. Return one pair
         (decision id, number) for each decision that has a label among the records, unless that
         becomes a dead letter: the number of its first label, whether that is new, was stored
-        before, or is corrected by a late stop. A new label keeps a positive number that is still
-        free (`Database.insert`), and is quarantined (kept out of training) if its decision is.
+        before, or is corrected by a late stop. A new label keeps its number if all stored numbers
+        are smaller, and otherwise gets the next one (`Database.insert`). It is quarantined (kept
+        out of training) if its decision is.
         """
         events = [record for record in records if isinstance(record, Event)]
         decisions = [record for record in records if isinstance(record, StoredDecision)]
@@ -124,7 +126,8 @@ class RecordInsertion:
 
         Return a text for each decision whose id is stored with other values, in columns or trace.
         A decision that is stored with the same values is passed over. The stored values are not
-        changed. No two of the decisions may have one id.
+        changed. No two of the decisions may have one id. New ones get the next numbers of the cell,
+        in their order; their attribute `number` is not used.
         """
         trace_columns = TRACE.c["decision_id", "channels", "samples", "data"]
         query = sa.select(*DECISION.c, *trace_columns).select_from(WITH_TRACES)

@@ -74,8 +74,8 @@ def encode_record(record: Record) -> bytes:
 
     They are the length of a JSON text, this text with the record's kind and fields, and the float32
     values of a decision's trace or of a label's `point`, the embedding of the trace. The number
-    and the label of a decision are left out, and so are the mark, length, checksum and digest that
-    stand before each record in a journal.
+    and the label of a decision are left out, and so is what stands before each record in a journal:
+    a mark (four bytes by which it is found), length, checksum and digest.
     """
     if isinstance(record, StoredDecision):
         row = decision_row(record) | {"shape": record.trace.shape}
@@ -328,7 +328,7 @@ class Journal:
         """Write the attribute `head` to the small file beside the journal, without a sync.
 
         The file is created if need be. A failure is ignored: an older head is harmless. The caller
-        holds `_describing`.
+        holds the lock `_describing`.
         """
         with suppress(OSError):
             descriptor = open_plain(head_path(self.path), os.O_WRONLY | os.O_CREAT)
@@ -338,10 +338,11 @@ class Journal:
     def clear(self) -> None:
         """Remove all records; the caller has made sure that the store holds them.
 
-        The file is synced first, so that no disk keeps the cut without the header. It is cut off
-        behind its header, which is written anew and says that the store holds all. Then space is
-        reserved (`reserve`; none on a full disk) and synced. The head file is not written. Raise
-        StoreError if the file cannot be written.
+        The file is synced first: after a power failure it might otherwise be cut off, but have an
+        older header, by which the store lacks records. It is cut off behind its header, which is
+        written anew and says that the store holds all. Then space is reserved (`reserve`; none on a
+        full disk) and synced. The head file is not written. Raise StoreError if the file cannot be
+        written.
         """
         self.reserve()  # syncs, so that no disk keeps the cut without the header
         with self._describing, _os_errors(self.path):
@@ -400,7 +401,7 @@ class Journal:
         self._file.close()
 
     def _write_header(self) -> None:
-        """Write the header, the first 256 bytes: MAGIC, then JSON, padded with zeros.
+        """Write the header, the first 256 bytes: the text MAGIC, then JSON, padded with zeros.
 
         The JSON has this process as the owner, the number of the records that the store has, the
         offset behind them, the newest ledger entry, and a CRC-32 of these fields. Nothing is
@@ -480,7 +481,8 @@ class Journal:
         """Return the encoded record at an offset, without what stands before it in the file.
 
         That is a mark, the length, the CRC-32 and a digest, which is not checked here. Return None
-        if no record begins there, or if it is cut off or its CRC-32 differs.
+        if no record begins there, or if it is cut off or its CRC-32 differs. Raise OSError if the
+        disk cannot be read.
         """
         frame = self._file.read(FRAME.size, offset)
         if len(frame) < FRAME.size or not frame.startswith(MARK):
@@ -514,9 +516,10 @@ def _os_errors(path: Path, owning: bool = True) -> AbstractContextManager[None]:
 def _open_file(path: Path, owning: bool = True) -> OwnedFile:
     """Open a journal's file: locked, for writing, and created if need be; or only for reading.
 
-    If `owning` is False, it is only read, not locked, and must exist. Raise StoreError if the
-    system refuses, for a symbolic link, or if another engine has locked it; the message then names
-    that engine's process, if the header can be read.
+    If `owning` is False, it is only read, not locked, and must exist; otherwise its folder is
+    created, too, if need be. Raise StoreError if the system refuses, for a symbolic link, or if
+    another engine has locked it; the message then names that engine's process, if the header can be
+    read.
     """
     with _os_errors(path, owning):
         try:

@@ -133,8 +133,9 @@ class JournalledStore(Outbox):
     def _begin_check(self) -> None:
         """Compare the store with its ledger; put a difference into `integrity_error`, and log it.
 
-        While there is an `integrity_error`, every part is verified. SQLite's own check of the file
-        runs in a thread. It is waited for only CHECK_SECONDS (0.1 s); later it may still set
+        While there is an `integrity_error`, every part is verified. SQLite's own check of the file,
+        without the tables of traces and events, runs in a thread; if it fails, its error counts as
+        a difference. It is waited for only CHECK_SECONDS (0.1 s); later it may still set
         `integrity_error`. Raise StoreError if the database cannot be read.
         """
         check = threading.Thread(
@@ -266,10 +267,10 @@ class JournalledStore(Outbox):
         """Return a decision with its label from memory or database, or None if unknown.
 
         A label that is not on disk yet is left out, unless `unsynced` is True. A label from memory
-        comes without number and time. Raise StoreError if the database is needed and has a fault or
-        does not answer within `limit` seconds, or if the stored trace is damaged or cannot be read.
-        Raise it also for an id whose last decision was not recorded, because the id could not be
-        looked up.
+        comes without number and time. Raise StoreError if the database is needed, and there is a
+        `Drainer.fault` (of the journal, too) or no answer within `limit` seconds, or if the stored
+        trace is damaged or cannot be read. Raise it also for an id whose last decision was not
+        recorded, because the id could not be looked up.
         """
         with self._changed:
             if decision_id in self._unrecorded:
