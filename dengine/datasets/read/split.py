@@ -13,7 +13,7 @@ from ..table import Cells, Table, UnreadableError, as_word
 from ..triggers import as_trigger
 from . import frames
 from .clock import is_dated
-from .text import NUMBER, WORD, Kind, read_text
+from .text import read_text
 
 NUMBERED = r"(\d+(?:\.\d+)?)"  # for which `*` stands in a wide table: `F*` is not `Fmax`
 OBJECTS = ("json", "jsonl", "ts")
@@ -25,8 +25,7 @@ def table_of(content: bytes, name: str, description: Description) -> Table:
     Any other format than `ts`, `json`, `jsonl`, `parquet` and `npz` is read as text. `content` has
     the bytes of the file, and `name` is its name in errors. Raises UnreadableError or DataError if
     the file does not have this format, and DataError without pyarrow for a Parquet file. Raises
-    LookupError for an encoding that Python does not know, and for a text file SettingError if
-    `windows.trigger` is malformed.
+    LookupError for an encoding that Python does not know.
     """
     kind = description.format
     form = description.text
@@ -38,34 +37,19 @@ def table_of(content: bytes, name: str, description: Description) -> Table:
         return frames.read_parquet(content, name)
     if kind == "npz":
         return frames.read_npz(content, name, description.layout == "npz")
-    return read_text(content, name, form, column_kind(description))
+    return read_text(content, name, form, word_columns(description))
 
 
-def column_kind(description: Description) -> Kind:
-    """Return a function from a column's name to its kind: "number", "word", or "" if not needed.
+def word_columns(description: Description) -> set[str]:
+    """Return the columns whose cells are read as words, also if they are channels, too.
 
-    Words are dates, part numbers, labels, the column of `order` and those in `[rows]`, also if they
-    are channels, too. Numbers are other columns of channels, of times, and of the signals of the
-    trigger. A column that the description does not name so is not needed. Raises SettingError if
-    `windows.trigger` is malformed.
+    These are dates, part numbers, labels, the column of `order` and those in `[rows]`.
     """
     clock = description.time
     forms = zip(clock.column, clock.format, strict=False)
-    dated = {name for name, form in forms if is_dated(form)}
-    order = {description.order} - ORDERS
-    words = dated.union(description.part.column, description.rows, order)
-    words |= {source.column for source in description.labels}
-    numbers = {*clock.column, *signals_of(description)}
-    patterns = [*map(pattern_of, description.channels)]
-
-    def kind_of(name: str) -> str:
-        """Return "word", "number" or "" for the column of this name; "word" if both fit."""
-        if name in words:
-            return WORD
-        is_channel = any(pattern.fullmatch(name) for pattern in patterns)
-        return NUMBER if is_channel or name in numbers else ""
-
-    return kind_of
+    words = {name for name, form in forms if is_dated(form)}
+    words.update(description.part.column, description.rows, {description.order} - ORDERS)
+    return words.union(source.column for source in description.labels)
 
 
 def signals_of(description: Description) -> Sequence[str]:
