@@ -138,45 +138,39 @@ def _split_wide(table: Table, description: Description) -> Iterator[Table]:
     A channel like `x*` gets its samples from the columns in which a number stands for the `*`, in
     the order of these numbers, without empty cells at the end. A list in any other cell becomes a
     column, or several; a column without a cell for each row is in every part as a whole, and an
-    empty one in none. A part has damage if its row had a wrong number of cells, or if the items of
-    a list in it are not all alike; then it has only its numbered channels.
-    """
-    groups: dict[str, list[str]] = {}
-    curves: frames.Columns = {}
-    units = {**table.units}
-    for key in description.channels:
-        names = [match[0] for match in match_numbered(key, table.columns)]
-        if ANY in key and names:
-            groups[key] = names
-            curves[key] = np.stack([*map(table.column, names)], axis=1)
-            units[key] = units.get(names[0], "")
-    used = {*chain(*groups.values())}
-    others = {name: c for name, c in table.columns.items() if len(c) and name not in used}
-    rest = replace(table, columns=others, units=units, origin=groups)
-    for i in range(len(table.lines)):
-        part = _row_of(rest, i)
-        samples = {key: without_empty_end(rows[i]) for key, rows in curves.items()}
-        yield replace(part, columns={**part.columns, **samples})
-
-
-def _row_of(table: Table, i: int) -> Table:
-    """Return row i as the table of a part; a list in a cell becomes a column, or several.
-
-    A column that does not have a cell for each row is taken as a whole. The part has damage if the
-    row had a wrong number of cells. If the items of a list in a cell are not all alike, that is its
-    only damage, and it has no columns.
+    empty one in none. A part has damage if its row had a wrong number of cells. If the items of a
+    list in it are not all alike, that is its only damage, and it has no columns.
     """
     n = len(table.lines)
-    line = table.lines[i]
-    source = f"{table.source}, row {line or i + 1}" if n > 1 else table.source
-    damage = [error for error in table.damage if error.line == line]
-    row = {name: cells[i] if len(cells) == n else cells for name, cells in table.columns.items()}
-    columns: frames.Columns = {}
-    try:
-        columns = frames.columns_of("", row)
-    except UnreadableError as error:
-        damage = [error]
-    return replace(table, source=source, columns=columns, lines=[line], damage=damage)
+    origin: dict[str, list[str]] = {}
+    units = {**table.units}
+    cells = {name: column for name, column in table.columns.items() if len(column)}
+    for key in filter(lambda key: ANY in key, description.channels):
+        if names := [match[0] for match in match_numbered(key, table.columns)]:
+            origin[key] = names
+            units[key] = units.get(names[0], "")
+            cells[key] = np.stack([*map(table.column, names)], axis=1)
+    for name in chain(*origin.values()):
+        cells.pop(name, None)
+    for i, line in enumerate(table.lines):
+        row = {name: column[i] if len(column) == n else column for name, column in cells.items()}
+        damage = [error for error in table.damage if error.line == line]
+        columns: frames.Columns = {}
+        try:
+            columns = frames.columns_of("", row)
+        except UnreadableError as error:
+            damage = [error]
+        columns |= {key: without_empty_end(columns[key]) for key in origin if key in columns}
+        source = f"{table.source}, row {line or i + 1}" if n > 1 else table.source
+        yield replace(
+            table,
+            source=source,
+            columns=columns,
+            lines=[line],
+            units=units,
+            damage=damage,
+            origin=origin,
+        )
 
 
 def match_numbered(key: str, columns: Iterable[str]) -> list[re.Match[str]]:
