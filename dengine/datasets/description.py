@@ -12,6 +12,7 @@ import difflib
 import re
 import sys
 import tomllib
+from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
@@ -87,10 +88,14 @@ class RowWords:
     drop: Words = ()
     invalid: Words = ()
 
-    def kind(self, word: str) -> str:
-        """Return "keep", "drop" or "invalid" for a word; "" if its meaning is not stated."""
-        kinds = (f.name for w in (word, ANY) for f in fields(self) if w in getattr(self, f.name))
-        return next(kinds, "")
+    @property
+    def kinds(self) -> defaultdict[str, str]:
+        """What each word means, "keep", "drop" or "invalid"; "" for a word without a meaning.
+
+        Of several meanings the first of these counts.
+        """
+        kinds = {word: k for k in ("invalid", "drop", "keep") for word in getattr(self, k)}
+        return defaultdict(lambda: kinds.get(ANY, ""), kinds)
 
 
 @dataclass(frozen=True, slots=True)

@@ -89,10 +89,10 @@ def times_of(table: Table, clock: Clock, form: TextForm) -> Times:
         cells = table.column(name)
         if not len(cells):
             raise UnreadableError("Expected times, got none", column=name)
-        is_date = cells.dtype.kind == "M"
-        if is_date or is_dated(unit):
+        unit = ISO if cells.dtype.kind == "M" else unit
+        if is_dated(unit):
             values, first = _dates(table, name, unit, clock)
-            period = 0.0 if is_date or any(map(has_day, clock.format)) else DAY
+            period = 0.0 if any(map(has_day, (unit, *clock.format))) else DAY
         else:
             scale = scale_of(unit)
             times: Cells = table.numbers(name, form)
@@ -123,11 +123,10 @@ def _dates(table: Table, name: str, unit: str, clock: Clock) -> Times:
     """
     import pandas as pd
 
-    has_date = "%" not in unit or has_day(unit)
-    texts = pd.Series(table.column(name))
-    if texts.dtype.kind != "M":
-        texts = texts.astype(str).str.strip().str.replace(",", ".", regex=False)
-    form = unit.replace(",", ".") if "%" in unit else "ISO8601"
+    has_date = has_day(unit)
+    texts = pd.Series(table.column(name)).astype(str).str.strip()
+    texts = texts.str.replace(",", ".", regex=False)
+    form = "ISO8601" if unit == ISO else unit.replace(",", ".")
     with instead(
         UnreadableError, f"Expected times of the form {unit}", ValueError, AttributeError, re.error
     ):

@@ -67,10 +67,10 @@ def line_word(lines: Sequence[str], beginning: str) -> str:
 
     lines : the lines above the header of a file.
     """
-    texts = [line.lstrip(f"#%*{MARKS}") for line in lines]
-    texts = [text[len(beginning) :] for text in texts if text.startswith(beginning)]
-    for text in sorted(texts, key=lambda text: re.match(r"[\"' ]*([;:=\t,]|  |$)", text) is None):
-        return re.split(r"[;\t,]", text.strip(MARKS))[0].strip(MARKS)
+    for end in ("(?=[\"' ]*([;:=\t,]|  |$))", ""):
+        pattern = f"(?m)^[#%*{MARKS}]*{re.escape(beginning)}{end}[{MARKS}]*(?P<word>[^;\t,\n]*)"
+        if match := re.search(pattern, "\n".join(lines)):
+            return match["word"].rstrip(MARKS)
     raise UnreadableError(f"Expected a line above the header that begins with {beginning}")
 
 

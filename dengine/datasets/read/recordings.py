@@ -112,8 +112,8 @@ def kept_rows(table: Table, rows: Mapping[str, RowWords]) -> tuple[Table, Cells]
     is_lost: Cells = np.zeros(n, dtype=bool)
     for column, about in rows.items():
         words = table.words(column)
-        kind_of = {word: about.kind(word) for word in {*words}}
-        kind = np.array([kind_of[word] for word in words], dtype=object)
+        kinds = about.kinds
+        kind = np.array([kinds[word] for word in words], dtype=object)
         wanted = f"one of the words {listed(sorted(about.keep + about.drop + about.invalid))}"
         table.refuse(kind == "", wanted, column)
         kind = np.broadcast_to(kind, is_lost.shape)  # one cell holds for all rows
@@ -155,15 +155,15 @@ def label_of(labels: Sequence[LabelReader], table: Table, part: str) -> int | No
     only one of them says that it was not checked, and DataError if the path of a source is no
     regular expression with one group.
     """
-    label, *others = [reader.label(table, part) for reader in labels]
-    for i, other in enumerate(others, 1):
-        if other != label:
+    found = [reader.label(table, part) for reader in labels]
+    for i, label in enumerate(found):
+        if label != found[0]:
             raise UnreadableError(
-                f"Expected labels that agree, [label] says {WORDS[label]}, [[check]] {i} says "
-                f"{WORDS[other]}",
+                f"Expected labels that agree, [label] says {WORDS[found[0]]}, [[check]] {i} says "
+                f"{WORDS[label]}",
                 column=labels[i].source.column,
             )
-    return label
+    return found[0]
 
 
 def read_recordings(
@@ -283,9 +283,11 @@ def is_dropped(part: Table, rows: Mapping[str, RowWords]) -> bool:
 
     So has a row of a wide table with the samples of another signal.
     """
-    cells = {name: part.columns[name] for name in rows if name in part.columns}
-    words = {name: as_word(cell[0]) for name, cell in cells.items() if len(cell) == 1}
-    return any(rows[name].kind(word) == "drop" for name, word in words.items())
+    for name in rows.keys() & part.columns.keys():
+        cells = part.columns[name]
+        if len(cells) == 1 and rows[name].kinds[as_word(cells[0])] == "drop":
+            return True
+    return False
 
 
 def dataset_of(recordings: Sequence[Recording], description: Description) -> Dataset:

@@ -113,14 +113,14 @@ def _listed(table: Table, times: Floats, description: Description, base: Path) -
     zero = times[0] if bounds[1].max() < EPOCH <= times[0] else 0.0
     begins, ends = np.array(bounds) + zero
     margin = 1.5 / (description.time.rate_hz or np.inf) + TOLERANCE
-    latest = -np.inf
+    least = times[0] - margin
     for begin, end, key in sorted(zip(begins, ends, keys.tolist(), strict=True)):
         rows = np.flatnonzero((times >= begin) & (times < end))
         fault = ""
-        if begin < latest - TOLERANCE:
-            fault = "Expected windows apart, it overlaps the one before"
-        elif not len(rows) or begin < times[0] - margin or end > times[-1] + margin:
-            fault = "Expected samples in the whole window, it has none or goes beyond the recording"
-        latest = max(latest, end)
-        window = slice(rows[0], rows[-1] + 1) if len(rows) else slice(1)
-        yield key, window, fault
+        if not len(rows) or begin < least or end > times[-1] + margin:
+            fault = (
+                "Expected samples in the whole window, it has none, goes beyond the recording or "
+                "overlaps the window before"
+            )
+        least = max(least, end - TOLERANCE)
+        yield key, slice(rows[0], rows[-1] + 1) if len(rows) else slice(1), fault
