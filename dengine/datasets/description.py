@@ -283,7 +283,7 @@ class Description:
     files
         Patterns of the files, like `*.csv` or `**/*.csv`.
     exclude
-        Patterns of files that are no recordings.
+        Patterns, like those of `files`, of files that are no recordings.
     format
         What kind of files they are: `text`, `json`, `jsonl`, `parquet`, `npz`, `ts`, `mcap` or
         `frame`.

@@ -7,7 +7,7 @@ import numpy as np
 
 from ...errors import listed
 from ...records import Floats
-from ..checks import check_clock
+from ..checks import check_forms
 from ..dataset import LEAST_RATE_HZ, MOST_RATE_HZ, Fault
 from ..description import UNKNOWN
 from ..read.clock import UNITS, check_steps, has_day, scale_of, times_of
@@ -171,10 +171,10 @@ def propose_rate(p: Proposal, tables: Tables) -> None:
     recordings than 10 % plus one, `time.gap` is set to `?`, with a note on the first. If all
     recordings start after 1999 (UTC), `order` is set to `time`, also if the rate is `?`. Recordings
     whose times cannot be read are skipped. Stated keys stay. Raises DataError if a stated format is
-    no form or unit of times, or if a setting in `[time]` is wrong (see `check_clock`).
+    no form or unit of times, or if a setting in `[time]` is wrong (see `check_forms`).
     """
     clock = p.description.time
-    check_clock(clock)
+    check_forms(clock, p.description.text)
     clocks = list[tuple[Table, Floats, float]]()
     for table in tables:
         with suppress(UnreadableError):

@@ -61,7 +61,7 @@ def times_of(table: Table, clock: Clock, form: TextForm) -> Times:
     table : Table
         The rows of a recording.
     clock : Clock
-        The section `[time]`, which has passed `check_clock`. The times in its columns are added up;
+        The section `[time]`, which has passed `check_forms`. The times in its columns are added up;
         a column of one cell holds for all rows, and a column of datetimes needs no format. Without
         columns there is one time, 0.
     form : TextForm

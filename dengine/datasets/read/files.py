@@ -1,6 +1,5 @@
 """The files that a description names, their content, and how errors in them become faults."""
 
-import fnmatch
 import gzip
 import re
 import zlib
@@ -65,16 +64,13 @@ def find_files(root: Path, description: Description) -> list[str]:
 
     They are sorted by file name, run_2 before run_10. Listings, the description file and files that
     match a pattern in `exclude` are left out. If `root` is a file, its name alone is returned,
-    whatever the description says. Raises DataError if no file is left, or for a malformed pattern
-    in `files`.
+    whatever the description says. Raises DataError if no file is left, or for a malformed pattern.
     """
     if root.is_file():
         return [root.name]
     aside = {FOLDER_FILE, description.windows.listing}
     aside |= {source.listing for source in description.labels}
-    names = match_files(root, description.files) - aside
-    for pattern in description.exclude:
-        names -= {*fnmatch.filter(names, pattern)}
+    names = match_files(root, description.files) - match_files(root, description.exclude) - aside
     if not names:
         raise DataError(
             f"Expected files {', '.join(description.files)} in {root}, found none; is it the "
