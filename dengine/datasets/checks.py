@@ -80,16 +80,13 @@ def without_repeats(recordings: Sequence[Recording]) -> tuple[list[Recording], l
     The recordings kept stay in their order. All traces must have the same shape (C, T). Two traces
     are equal if they have the same `content_hash`, which rounds samples down to 1/65,536 of their
     unit, and counts lost samples as 0. Of equal traces with one label the first is kept; if their
-    labels differ, none is kept. A trace whose finite samples are all the same is always kept: a
-    dead sensor gives it for any part.
+    labels differ, none is kept. So it is with traces of a dead sensor, which never train.
     """
     traces = [recording.trace for recording in recordings]
     hashes = content_hash(np.stack(traces)).tolist() if traces else []
-    groups = defaultdict[tuple[int, int], list[Recording]](list)
-    for i, trace in enumerate(traces):
-        samples = trace[np.isfinite(trace)]
-        is_dead = (samples == samples[:1]).all()
-        groups[hashes[i], i if is_dead else -1].append(recordings[i])
+    groups = defaultdict[int, list[Recording]](list)
+    for hash_, recording in zip(hashes, recordings, strict=True):
+        groups[hash_].append(recording)
     kept: list[Recording] = []
     faults: list[Fault] = []
     for first, *repeats in groups.values():

@@ -49,9 +49,8 @@ def load_dataset(
         The channels to read, "FZ_Base" or "FZ_Base,FX_Base", among those that the description or
         the data set names. None: all channels.
     samples : int, optional
-        Number of samples of each trace: the rest is cut off at the end. If the description states
-        fewer samples, or none, or resamples the traces, this number replaces the one that it
-        states. None: as the description states, or as the data set is.
+        Number of samples of each trace: the rest is cut off at the end. None: as the description
+        states, or as the data set is.
     progress : callable, optional
         Called with 1 after each file that is read by a description; once for a bag or a table.
 
@@ -67,9 +66,9 @@ def load_dataset(
     DataError
         If the description is missing or has a key whose value is `?` (the message says what to
         type), if the source or a channel does not exist, if no recording is left, if `samples` is
-        below 1, or if traces that were read without a description are shorter than `samples`, or
-        longer although they were resampled. Also if none of the files can be read, a listing of
-        labels cannot, or the traces and labels do not fit together (`make_dataset`).
+        below 1, or if the traces are shorter than `samples`, or longer although they were
+        resampled. Also if none of the files can be read, a listing of labels cannot, or the traces
+        and labels do not fit together (`make_dataset`).
     SettingError
         If `windows.trigger` of the description, which cuts long recordings, is malformed.
     ValueError
@@ -87,10 +86,6 @@ def load_dataset(
         place = as_source(source)
         about = description_of(place, description)
         about = about.with_channels(names) if names else about
-        traces = about.traces
-        is_stated = isinstance(traces.samples, int) and traces.lengths != "resample"
-        if samples is not None and not (is_stated and samples <= traces.samples):
-            about = about.with_values({"traces.samples": samples})
         data = read_recordings(place, about, progress)
     return data if samples is None else data.cut(samples)
 

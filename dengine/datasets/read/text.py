@@ -8,7 +8,6 @@ import codecs
 import csv
 import io
 import re
-import warnings
 from collections.abc import Container, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -38,7 +37,7 @@ def read_text(
         How the file is written: the section `[text]`.
     words : container of str, optional
         The columns whose cells are read as texts. The cells of any other column are numbers if the
-        file is plain and they are all finite numbers, otherwise texts, or both. A file is plain if
+        file is plain and pandas reads them all as numbers, otherwise texts. A file is plain if
         pandas can read it without doubt, and `form.drop` is empty. None: all columns.
 
     Returns
@@ -163,7 +162,7 @@ def _read_plain(
 
     Not plain are a row with a wrong number of cells, an empty line, an empty last cell, and a cell
     with a line break; nor is a file of which `form.drop` leaves out lines. A column that pandas
-    does not read as finite numbers has texts, or numbers beside texts.
+    does not read as numbers has texts.
 
     table : has the names of the columns, which are empty, and the lines of the rows. words : the
     columns whose cells are read as texts; None: all.
@@ -174,27 +173,28 @@ def _read_plain(
         return None
     texts = [name for name in table.columns if words is None or name in words]
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", pd.errors.DtypeWarning)
-            frame = pd.read_csv(
-                io.BytesIO(content),
-                sep=r"\s+" if form.delimiter == BLANK else form.delimiter,
-                header=None,
-                skiprows=table.lines[0] - 1,
-                names=[*table.columns],
-                decimal=form.decimal,
-                dtype=dict.fromkeys(texts, "category"),
-                keep_default_na=False,
-            )
+        frame = pd.read_csv(
+            io.BytesIO(content),
+            sep=r"\s+" if form.delimiter == BLANK else form.delimiter,
+            header=None,
+            skiprows=table.lines[0] - 1,
+            names=[*table.columns],
+            decimal=form.decimal,
+            dtype=dict.fromkeys(texts, "category"),
+            keep_default_na=False,
+            low_memory=False,  # so a column has numbers or texts, not both
+        )
     except (ValueError, OverflowError):  # a row of too many cells, among others
         return None
     is_whole = len(frame) == len(table.lines) and isinstance(frame.index, pd.RangeIndex)
     if not is_whole or frame.iloc[:, -1].isin(["", np.nan]).any():  # the end of a cut row
         return None
-    columns = {name: frame[name].to_numpy() for name in frame}
-    for name in texts:  # equal words are one object
-        cells = frame[name].array
-        columns[name] = np.array(cells.categories, dtype=object)[cells.codes]
+    columns = {**table.columns}
+    for name, cells in frame.items():
+        if name in texts:  # equal words are one object
+            columns[name] = np.array(cells.array.categories, dtype=object)[cells.array.codes]
+        else:
+            columns[name] = cells.to_numpy()
     return replace(table, columns=columns)
 
 
