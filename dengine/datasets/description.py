@@ -207,8 +207,8 @@ class LabelSource:
     @property
     def meanings(self) -> dict[str, int | None]:
         """What each word means: 1 good, 0 bad, None not checked; of several, the first of these."""
-        meanings: dict[str, int | None] = dict.fromkeys(self.unchecked)
-        return meanings | dict.fromkeys(self.bad, 0) | dict.fromkeys(self.good, 1)
+        kinds = ((self.unchecked, None), (self.bad, 0), (self.good, 1))
+        return {word: meaning for words, meaning in kinds for word in words}
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,15 +18,15 @@ DATE = re.compile(r"(?<![0-9])([0-9]{2})\.([0-9]{2})\.([0-9]{4})(?![0-9])")
 BAD = (ValueError, NotImplementedError, OSError, IndexError)  # what an unusable pattern raises
 
 
-def natural_key(text: str) -> list[tuple[int, int, str]]:
+def natural_key(text: str) -> list[Any]:
     """Return a key that sorts runs of digits in texts by their size: run_2 before run_10.
 
     Decimals and signs do not count: 0.5 is before 0.25. Dates like 31.12.2025 are sorted by year,
     month and day.
     """
-    text = DATE.sub(r"\3.\2.\1", text)
-    pieces = re.split(r"([0-9]+)", text)
-    return [(1, int(p), "") if p.isascii() and p.isdecimal() else (0, 0, p) for p in pieces if p]
+    pieces: list[Any] = re.split(r"([0-9]+)", DATE.sub(r"\3.\2.\1", text))
+    pieces[1::2] = map(int, pieces[1::2])  # texts and numbers take turns
+    return pieces
 
 
 def as_source(source: Any) -> Any:

@@ -4,7 +4,6 @@ pandas' C parser reads plain files. Where it meets anything odd, the standard `c
 file again, and names the cell that does not fit.
 """
 
-import codecs
 import csv
 import io
 import re
@@ -82,11 +81,8 @@ def to_utf8(content: bytes, encoding: str) -> bytes:
     encoding does not say where), if a byte does not fit the encoding or if the text has a zero, and
     LookupError for an encoding that Python does not know.
     """
-    is_utf8 = codecs.lookup(encoding).name == "utf-8"
     try:
-        if not (is_utf8 and content.isascii()):
-            text = content.decode(encoding).removeprefix("\ufeff")
-            content = text.encode("utf-8", "replace")
+        content = content.decode(encoding).removeprefix("\ufeff").encode("utf-8", "replace")
         bad = content.find(b"\0")
     except UnicodeError as error:  # some encodings do not say where
         bad = getattr(error, "start", 0)
