@@ -29,7 +29,7 @@ from .split import split, table_of
 from .windows import cut
 
 FRAME = "table"  # what a DataFrame is called in messages
-ROUNDING = 1e-6  # of a step: sums of float64 miss a time by less
+ROUNDING = 0.01  # of a step: float64 misses a date by less
 WORDS = {1: "good", 0: "bad", None: "not checked"}
 
 
@@ -68,14 +68,14 @@ def recording_of(
     seconds = None
     rank: Any = ""
     if clock.column:
-        seconds, start = times_of(table, clock, form)
+        seconds = times_of(table, clock, form)
         if clock.sort:
             rows = np.argsort(seconds, kind="stable")
             table = table.take(rows)
             is_lost = is_lost[rows]
-            seconds, start = times_of(table, clock, form)
+            seconds = seconds[rows]
         check_steps(seconds, clock, table)
-        rank = start if order == "time" else rank
+        rank = seconds[0] if order == "time" else rank
     samples = [samples_of(table, *item, form) for item in description.channels.items()]
     lengths = [*map(len, samples if seconds is None else [*samples, seconds])]
     if len({*lengths}) > 1:
@@ -324,7 +324,7 @@ def dataset_of(recordings: Sequence[Recording], description: Description) -> Dat
 def fitted(samples: Floats, seconds: Floats | None, description: Description) -> TraceArray:
     """Return the trace (C, T) of samples (C, n), brought to T samples as `[traces]` says.
 
-    `seconds`, shape (n,), has the times since the first sample; None without a clock. With
+    `seconds`, shape (n,), has the times of the samples; None without a clock. With
     `resample`, times and a stated rate, the samples are interpolated at that rate from the first
     time on. A longer recording loses its end; one that ends up to one step early is accepted, and
     its last sample repeated. With times but without a rate the whole recording is interpolated
@@ -343,6 +343,7 @@ def fitted(samples: Floats, seconds: Floats | None, description: Description) ->
     kind = FITS.index(about.lengths.removesuffix("-all"))
     can_fit = can_fit_length(n, about.samples, kind) or (about.lengths == "pad-all" and n > 0)
     if about.lengths == "resample" and seconds is not None:
+        seconds = seconds - seconds[0]
         times = np.linspace(0, seconds[-1], about.samples)
         if rate:
             times = np.arange(about.samples) / rate

@@ -40,9 +40,9 @@ def cut(table: Table, description: Description, base: Path) -> Iterator[Table]:
     name = table.source
     if not description.time.column:
         raise DataError(f"Expected time.column, the clock of {name}, which is one long recording.")
-    seconds, start = times_of(table.whole(), description.time, description.text)
+    times = times_of(table.whole(), description.time, description.text)
     find = _triggered if description.windows.trigger else _listed
-    windows = [*find(table, seconds + start, description, base)]
+    windows = [*find(table, times, description, base)]
     if not windows:
         raise DataError(f"Expected parts in {name}, found none; see [windows].")
     ends = [*(rows.start for _, rows, _ in windows[1:]), None]
@@ -108,8 +108,7 @@ def _listed(table: Table, times: Floats, description: Description, base: Path) -
         keys = listing.words(about.key)
         for column in (about.start, about.end):
             clock = Clock((column,), (about.format,), description.time.zone)
-            seconds, start = times_of(listing, clock, form)
-            bounds.append(seconds + (start - TOLERANCE))
+            bounds.append(times_of(listing, clock, form) - TOLERANCE)
     zero = times[0] if bounds[1].max() < EPOCH <= times[0] else 0.0
     begins, ends = np.array(bounds) + zero
     margin = 1.5 / (description.time.rate_hz or np.inf) + TOLERANCE
