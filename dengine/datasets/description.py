@@ -12,7 +12,6 @@ import difflib
 import re
 import sys
 import tomllib
-from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
@@ -88,14 +87,13 @@ class RowWords:
     drop: Words = ()
     invalid: Words = ()
 
-    @property
-    def kinds(self) -> defaultdict[str, str]:
-        """What each word means, "keep", "drop" or "invalid"; "" for a word without a meaning.
+    def kinds(self, words: Iterable[str]) -> list[str]:
+        """Return what each word means, "keep", "drop" or "invalid"; "" if that is not stated.
 
         Of several meanings the first of these counts.
         """
         kinds = {word: k for k in ("invalid", "drop", "keep") for word in getattr(self, k)}
-        return defaultdict(lambda: kinds.get(ANY, ""), kinds)
+        return [kinds.get(word, kinds.get(ANY, "")) for word in words]
 
 
 @dataclass(frozen=True, slots=True)

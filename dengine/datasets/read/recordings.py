@@ -18,7 +18,7 @@ from ...traces import can_fit_length, fit_length
 from ..checks import check_description, without_repeats
 from ..dataset import Dataset, Fault, make_dataset, unit_text
 from ..description import ANY, ORDERS, Channel, Description, RowWords, TextForm
-from ..table import Cells, Recording, Table, UnreadableError, as_word
+from ..table import Recording, Table, UnreadableError, as_word
 from ..units import bare, conversion, unit_in
 from .bags import read_bag
 from .clock import check_steps, times_of
@@ -64,7 +64,7 @@ def recording_of(
     clock = description.time
     form = description.text
     order = description.order
-    table, is_lost = kept_rows(table.whole(), description.rows)
+    table = kept_rows(table.whole(), description.rows)
     seconds = None
     rank: Any = ""
     if clock.column:
@@ -72,7 +72,6 @@ def recording_of(
         if clock.sort:
             rows = np.argsort(seconds, kind="stable")
             table = table.take(rows)
-            is_lost = is_lost[rows]
             seconds = seconds[rows]
         check_steps(seconds, clock, table)
         rank = seconds[0] if order == "time" else rank
@@ -80,9 +79,9 @@ def recording_of(
     lengths = [*map(len, samples if seconds is None else [*samples, seconds])]
     if len({*lengths}) > 1:
         raise UnreadableError(f"Expected channels and times of one length, got {lengths}")
-    if description.rows:
-        for values in samples:
-            values[is_lost] = np.nan
+    for column, about in description.rows.items():
+        is_lost = np.array(about.kinds(table.words(column))) == "invalid"
+        samples = [np.where(is_lost, np.nan, values) for values in samples]
     part = part_of(description.part, table)
     if not part and description.is_cut:
         part = table.path
@@ -98,29 +97,23 @@ def recording_of(
 
 
 @instead(UnreadableError, "Expected columns of one length", IndexError, ValueError)
-def kept_rows(table: Table, rows: Mapping[str, RowWords]) -> tuple[Table, Cells]:
-    """Return a table of the rows that are samples, and which of these are lost, bool (kept rows,).
+def kept_rows(table: Table, rows: Mapping[str, RowWords]) -> Table:
+    """Return a table of the rows that are samples, lost ones too.
 
-    A column takes its words from the rows that the columns before it keep. Without `rows` all are
-    kept. Raises UnreadableError for a word whose meaning is not stated, and for a column that is
+    A column takes its words from the rows that the columns before it keep; one of a single cell
+    drops no rows. Raises UnreadableError for a word whose meaning is not stated, and for a column that is
     missing, has lists or is of another length.
 
     rows : for each column, the words that keep a row, drop it, or mark its samples as lost; `*` is
     any other word.
     """
-    n = max(map(len, table.columns.values()), default=0)
-    is_lost: Cells = np.zeros(n, dtype=bool)
     for column, about in rows.items():
-        words = table.words(column)
-        kinds = about.kinds
-        kind = np.array([kinds[word] for word in words], dtype=object)
+        kinds = np.array(about.kinds(table.words(column)), dtype=np.str_)
         wanted = f"one of the words {listed(sorted(about.keep + about.drop + about.invalid))}"
-        table.refuse(kind == "", wanted, column)
-        kind = np.broadcast_to(kind, is_lost.shape)  # one cell holds for all rows
-        is_kept = kind != "drop"
-        is_lost = (is_lost | (kind == "invalid"))[is_kept]
-        table = table.take(is_kept)
-    return table, is_lost
+        table.refuse(kinds == "", wanted, column)
+        if len(kinds) > 1:
+            table = table.take(kinds != "drop")
+    return table
 
 
 def samples_of(table: Table, column: str, channel: Channel, form: TextForm) -> Floats:
@@ -285,7 +278,7 @@ def is_dropped(part: Table, rows: Mapping[str, RowWords]) -> bool:
     """
     for name in rows.keys() & part.columns.keys():
         cells = part.columns[name]
-        if len(cells) == 1 and rows[name].kinds[as_word(cells[0])] == "drop":
+        if len(cells) == 1 and rows[name].kinds([as_word(cells[0])]) == ["drop"]:
             return True
     return False
 
