@@ -141,7 +141,7 @@ class Dataset:
     @property
     def ordered(self) -> bool:
         """Whether this can be the order of recording; not if all traces of one label come first."""
-        return np.count_nonzero(np.diff(self.y)) != 1
+        return bool(np.count_nonzero(np.diff(self.y)) != 1)
 
     @property
     def cube(self) -> TraceArray:

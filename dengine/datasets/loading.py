@@ -267,9 +267,7 @@ def _read_npz(path: Path) -> Dataset:
     """
     arrays, _ = read_archive(path, OWN_ARRAYS)
     with read_errors(path, "an .npz file of plain arrays"):
-        X = arrays["X"]
-        if "scale" in arrays:
-            X = X.astype(np.float32) * arrays["scale"].astype(np.float32)
+        X = arrays["X"] * arrays.get("scale", np.ones(1)).astype(np.float32)
         units, channels = (
             [*map(str, np.atleast_1d(arrays.get(key, ())).tolist())] for key in ("unit", "channels")
         )

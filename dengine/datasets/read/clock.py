@@ -125,7 +125,8 @@ def _dates(table: Table, name: str, unit: str, clock: Clock) -> Floats:
             times = times.dt.tz_localize(zone, ambiguous="infer")
     table.refuse(times.isna().to_numpy(), f"a time of the form {unit}", name)
     zero = pd.Timestamp("1970-01-01" if has_day(unit) else "1900-01-01", tz="UTC")
-    return (times - zero).dt.total_seconds().to_numpy(np.float64)
+    seconds: Floats = (times - zero).dt.total_seconds().to_numpy(np.float64)
+    return seconds
 
 
 def check_steps(seconds: Floats, clock: Clock, table: Table) -> None:

@@ -101,8 +101,8 @@ def kept_rows(table: Table, rows: Mapping[str, RowWords]) -> Table:
     """Return a table of the rows that are samples, lost ones too.
 
     A column takes its words from the rows that the columns before it keep; one of a single cell
-    drops no rows. Raises UnreadableError for a word whose meaning is not stated, and for a column that is
-    missing, has lists or is of another length.
+    drops no rows. Raises UnreadableError for a word whose meaning is not stated, and for a column
+    that is missing, has lists or is of another length.
 
     rows : for each column, the words that keep a row, drop it, or mark its samples as lost; `*` is
     any other word.
@@ -286,8 +286,8 @@ def is_dropped(part: Table, rows: Mapping[str, RowWords]) -> bool:
 def dataset_of(recordings: Sequence[Recording], description: Description) -> Dataset:
     """Return the data set of recordings, at least one, in the given order.
 
-    `fit` is "strict" if the recordings were resampled at the stated rate of their clock, since live traces
-    then come at this rate; otherwise it is `traces.lengths` of the description, "pad" for
+    `fit` is "strict" if the recordings were resampled at the stated rate of their clock, since live
+    traces then come at this rate; otherwise it is `traces.lengths` of the description, "pad" for
     "pad-all". (`fit` says what happens to live traces of another length.) `limit`, the range of the
     sensor, is that of the first channel, None if it is not known. `part` is None if no recording
     has a part number. Raises DataError if `make_dataset` refuses the traces.

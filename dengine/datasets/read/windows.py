@@ -12,7 +12,6 @@ from ..description import Clock, Description
 from ..table import Table, UnreadableError
 from ..triggers import StartFinder, as_trigger
 from .clock import times_of
-from .frames import as_cells
 from .places import in_listing, listing_table
 from .split import verdicts_of
 
@@ -37,6 +36,8 @@ def cut(table: Table, description: Description, base: Path) -> Iterator[Table]:
     cannot be read, SettingError for a malformed trigger, and LookupError for a listing in an
     encoding that Python does not know.
     """
+    import pandas as pd
+
     name = table.source
     if not description.time.column:
         raise DataError(f"Expected time.column, the clock of {name}, which is one long recording.")
@@ -51,7 +52,7 @@ def cut(table: Table, description: Description, base: Path) -> Iterator[Table]:
         verdicts = {}
         for topic in verdicts_of(description):
             words = table.column(topic)[rows.start : end]
-            verdicts[topic] = as_cells([word for word in words if word is not None][:1])
+            verdicts[topic] = words[pd.notna(words)][:1]
         yield replace(
             part,
             source=f"{name}, {key}",
