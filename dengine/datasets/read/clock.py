@@ -48,10 +48,10 @@ def scale_of(unit: str) -> float:
 
 
 def times_of(table: Table, clock: Clock, form: TextForm) -> Floats:
-    """Return the time of each row in seconds, from the zero of the clock.
+    """Return the time of each row in seconds from the zero of the clock: the sum over its columns.
 
-    The zero is 1970 (UTC) for dates, midnight for times of day, and the sum over the columns counts.
-    A float64 rounds a date to 0.24 us.
+    The zero is 1970 (UTC) for dates, and midnight for times of day. A float64 rounds a date to 0.24
+    microseconds.
 
     If times of day fall from one row to the next by more than half a day, midnight has passed,
     unless a column of the clock has the date. If a counter falls by more than half of `clock.wrap`,
@@ -105,11 +105,12 @@ def times_of(table: Table, clock: Clock, form: TextForm) -> Floats:
 def _dates(table: Table, name: str, unit: str, clock: Clock) -> Floats:
     """Return the times in a column of dates or times of day.
 
-    They are in seconds since 1970 (UTC), or since midnight if the cells have no date. `unit` is the form of the cells, "iso"
-    or like "%d.%m.%Y"; a comma is read as a point. Dates without a time zone are in `clock.zone`,
-    or UTC if that is empty; times in the hour that comes twice need rows from both, in order.
-    Raises UnreadableError if there is no column `name`, or one of its cells does not have the form,
-    or is no single time because clocks are changed, or if the cells have several offsets from UTC.
+    They are in seconds since 1970 (UTC), or since midnight if the cells have no date. `unit` is the
+    form of the cells, "iso" or like "%d.%m.%Y"; a comma is read as a point. Dates without a time
+    zone are in `clock.zone`, or UTC if that is empty; times in the hour that comes twice need rows
+    from both, in order. Raises UnreadableError if there is no column `name`, or one of its cells
+    does not have the form, or is no single time because clocks are changed, or if the cells have
+    several offsets from UTC.
     """
     import pandas as pd
 
