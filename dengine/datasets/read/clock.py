@@ -151,7 +151,7 @@ def check_steps(seconds: Floats, clock: Clock, table: Table) -> None:
         row = int(is_bad.argmax()) + 1
         raise UnreadableError(
             f"Expected a later time, by at most time.gap steps, which are {most:.6g} s, got "
-            f"{steps[row - 1]:.3g} s before row {row + 1}",
+            f"{steps[row - 1]:.4g} s before row {row + 1}",
             table.line(row),
             column,
         )
