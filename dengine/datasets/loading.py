@@ -15,7 +15,7 @@ from ..records import stored_trace_spec
 from .dataset import OWN, Dataset, Progress, expect_data, make_dataset, unit_text
 from .describe import describe
 from .description import FOLDER_FILE, Description, Stated
-from .read.files import as_source, find_files
+from .read.files import as_source
 from .read.recordings import read_recordings
 
 BUNDLED = {"insertion": "insertion.npz"}
@@ -147,15 +147,6 @@ def description_of(
                 raise DataError(missing_text(source, proposal))
             return proposal
     return Description.load(description).with_values(stated or {})
-
-
-def count_files(source: str, description: Description | None) -> int:
-    """Return how many files of a source are read, for a progress bar.
-
-    It is 1 without a description; `source` is not looked at then. Raises DataError if the source
-    does not exist, the description fits no file, or one of its patterns is malformed.
-    """
-    return 1 if description is None else len(find_files(as_source(source), description))
 
 
 def missing_text(path: Path, proposal: Description) -> str:
