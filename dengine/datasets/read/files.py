@@ -54,7 +54,9 @@ def match_files(root: Path, patterns: Sequence[str]) -> set[str]:
     The paths have `/` between folders. Folders that match are left out. Raises DataError for a
     malformed pattern.
     """
-    with instead(DataError, f"Expected patterns below a folder in files, got {patterns}", *BAD):
+    with instead(
+        DataError, f"Expected patterns below a folder in files and exclude, got {patterns}", *BAD
+    ):
         paths = [path for pattern in patterns for path in root.glob(pattern)]
     return {path.relative_to(root).as_posix() for path in paths if path.is_file()}
 
