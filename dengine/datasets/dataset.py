@@ -107,6 +107,9 @@ class Dataset:
         Samples of each recording, as recorded.
     unlabelled : int
         Recordings that were left out because their part was not checked yet.
+    ordered : bool, default True
+        Whether the order of the traces can be that of the recording. False if all parts of one
+        label come first.
     """
 
     X: TraceArray
@@ -124,6 +127,7 @@ class Dataset:
     lengths: Ints | None = None
     notes: Names = ()
     unlabelled: int = 0
+    ordered: bool = True
 
     def __len__(self) -> int:
         """Return the number of traces; recordings that were left out do not count."""
@@ -137,11 +141,6 @@ class Dataset:
             f"<Dataset {self.name}: {len(self)} traces, {shape} samples, {good} good, "
             f"{len(self.faults)} left out>"
         )
-
-    @property
-    def ordered(self) -> bool:
-        """Whether this can be the order of recording; not if all traces of one label come first."""
-        return bool(np.count_nonzero(np.diff(self.y)) != 1)
 
     @property
     def cube(self) -> TraceArray:

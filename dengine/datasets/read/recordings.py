@@ -286,8 +286,9 @@ def is_dropped(part: Table, rows: Mapping[str, RowWords]) -> bool:
 def dataset_of(recordings: Sequence[Recording], description: Description) -> Dataset:
     """Return the data set of recordings, at least one, in the given order.
 
-    `fit` is "strict" if the recordings were resampled at the stated rate of their clock, since live
-    traces then come at this rate; otherwise it is `traces.lengths` of the description, "pad" for
+    `ordered` is False if the label changes exactly once from one recording to the next. `fit` is
+    "strict" if the recordings were resampled at the stated rate of their clock, since live traces
+    then come at this rate; otherwise it is `traces.lengths` of the description, "pad" for
     "pad-all". (`fit` says what happens to live traces of another length.) `limit`, the range of the
     sensor, is that of the first channel, None if it is not known. `part` is None if no recording
     has a part number. Raises DataError if `make_dataset` refuses the traces.
@@ -311,6 +312,7 @@ def dataset_of(recordings: Sequence[Recording], description: Description) -> Dat
         source=sources,
         fit="strict" if is_grid else fit,
         lengths=lengths,
+        ordered=np.count_nonzero(np.diff(labels)) != 1,
     )
 
 
