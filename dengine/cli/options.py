@@ -495,10 +495,11 @@ class DataChoice:
             If the data set is a store that cannot be opened or read.
         """
         from ..datasets import load_dataset
-        from ..datasets.loading import count_files
+        from ..datasets.read.files import as_source, find_files
 
         description = description or self.describe()
-        with progress_bar(f"reading {self.data}", count_files(self.data, description)) as advance:
+        n_files = len(find_files(as_source(self.data), description)) if description else 1
+        with progress_bar(f"reading {self.data}", n_files) as advance:
             data = load_dataset(
                 self.data,
                 description,

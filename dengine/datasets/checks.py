@@ -23,8 +23,8 @@ def check_description(description: Description) -> None:
     No key may have the value `?`, except in `[ignored]` and `[[check]]`. The number of samples of a
     trace must be 1 or more. There must be a channel, and all channels must have the same `limit`,
     the range of the sensor. With `order` "time" there must be a column of times. The settings in
-    `[time]` must pass `check_clock`, and those in `[text]` must pass `check_text`. Nothing else is
-    checked: neither a trigger nor an expression, nor whether columns exist.
+    `[time]` and `[text]` must pass `check_forms`. Nothing else is checked: neither a trigger nor an
+    expression, nor whether columns exist.
     """
     if open_keys := description.open_keys:
         raise DataError(f"Expected a description without ?, still open: {listed(open_keys)}.")
@@ -38,43 +38,31 @@ def check_description(description: Description) -> None:
             "one limit for all channels": len(limits) == 1,
         }
     )
-    check_clock(description.time)
-    check_text(description.text)
+    check_forms(description.time, description.text)
 
 
-def check_clock(clock: Clock) -> None:
-    """Raise DataError unless times can be read with the settings in `[time]`.
+def check_forms(clock: Clock, text: TextForm) -> None:
+    """Raise DataError unless files can be read with the settings in `[time]` and `[text]`.
 
     A time zone, if stated, must have a known name, and a rate, if stated, must be between 1 Hz and
     1 MHz, both included. If there are columns of times, there must be as many formats; what these
-    say is not checked.
+    say is not checked. Python must know the encoding. The delimiter and the decimal mark must be
+    one character each. The decimal mark and the mark of thousands, which may be "", must differ,
+    and be no digit, sign, e or E; the delimiter is not compared with them. `text.data`, the line of
+    the first samples, must be 1 or more.
     """
     with instead(DataError, "Expected a time zone in time.zone", LookupError, ValueError, OSError):
         ZoneInfo(clock.zone or "UTC")
+    with instead(DataError, "Expected an encoding in text.encoding", LookupError, ValueError):
+        "".encode(text.encoding)  # also refuses codecs that are of no text
     n = len(clock.column)
+    marks = (text.delimiter, text.decimal)
     expect_all(
         {
             "a rate of 1 Hz to 1 MHz in time.rate_hz": (
                 not clock.rate_hz or LEAST_RATE_HZ <= clock.rate_hz <= MOST_RATE_HZ
             ),
             f"a format for each of {n} columns in [time]": n in (0, len(clock.format)),
-        }
-    )
-
-
-def check_text(text: TextForm) -> None:
-    """Raise DataError unless text files can be read with the settings in `[text]`.
-
-    Python must know the encoding. The delimiter and the decimal mark must be one character each.
-    The decimal mark and the mark of thousands, which may be "", must differ, and be no digit, sign,
-    e or E; the delimiter is not compared with them. `text.data`, the line of the first samples,
-    must be 1 or more.
-    """
-    with instead(DataError, "Expected an encoding in text.encoding", LookupError, ValueError):
-        "".encode(text.encoding)  # also refuses codecs that are of no text
-    marks = (text.delimiter, text.decimal)
-    expect_all(
-        {
             f"one character each in text.delimiter and text.decimal, got {marks}": (
                 [*map(len, marks)] == [1, 1]
             ),
@@ -92,16 +80,13 @@ def without_repeats(recordings: Sequence[Recording]) -> tuple[list[Recording], l
     The recordings kept stay in their order. All traces must have the same shape (C, T). Two traces
     are equal if they have the same `content_hash`, which rounds samples down to 1/65,536 of their
     unit, and counts lost samples as 0. Of equal traces with one label the first is kept; if their
-    labels differ, none is kept. A trace whose finite samples are all the same is always kept: a
-    dead sensor gives it for any part.
+    labels differ, none is kept. So it is with traces of a dead sensor, which never train.
     """
     traces = [recording.trace for recording in recordings]
     hashes = content_hash(np.stack(traces)).tolist() if traces else []
-    groups = defaultdict[tuple[int, int], list[Recording]](list)
-    for i, trace in enumerate(traces):
-        samples = trace[np.isfinite(trace)]
-        is_dead = (samples == samples[:1]).all()
-        groups[hashes[i], i if is_dead else -1].append(recordings[i])
+    groups = defaultdict[int, list[Recording]](list)
+    for hash_, recording in zip(hashes, recordings, strict=True):
+        groups[hash_].append(recording)
     kept: list[Recording] = []
     faults: list[Fault] = []
     for first, *repeats in groups.values():

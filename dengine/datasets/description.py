@@ -87,10 +87,13 @@ class RowWords:
     drop: Words = ()
     invalid: Words = ()
 
-    def kind(self, word: str) -> str:
-        """Return "keep", "drop" or "invalid" for a word; "" if its meaning is not stated."""
-        kinds = (f.name for w in (word, ANY) for f in fields(self) if w in getattr(self, f.name))
-        return next(kinds, "")
+    def kinds(self, words: Iterable[str]) -> list[str]:
+        """Return what each word means, "keep", "drop" or "invalid"; "" if that is not stated.
+
+        Of several meanings the first of these counts.
+        """
+        kinds = {word: k for k in ("invalid", "drop", "keep") for word in getattr(self, k)}
+        return [kinds.get(word, kinds.get(ANY, "")) for word in words]
 
 
 @dataclass(frozen=True, slots=True)
@@ -202,8 +205,8 @@ class LabelSource:
     @property
     def meanings(self) -> dict[str, int | None]:
         """What each word means: 1 good, 0 bad, None not checked; of several, the first of these."""
-        meanings: dict[str, int | None] = dict.fromkeys(self.unchecked)
-        return meanings | dict.fromkeys(self.bad, 0) | dict.fromkeys(self.good, 1)
+        kinds = ((self.unchecked, None), (self.bad, 0), (self.good, 1))
+        return {word: meaning for words, meaning in kinds for word in words}
 
 
 @dataclass(frozen=True, slots=True)
@@ -278,7 +281,7 @@ class Description:
     files
         Patterns of the files, like `*.csv` or `**/*.csv`.
     exclude
-        Patterns of files that are no recordings.
+        Patterns, like those of `files`, of files that are no recordings.
     format
         What kind of files they are: `text`, `json`, `jsonl`, `parquet`, `npz`, `ts`, `mcap` or
         `frame`.

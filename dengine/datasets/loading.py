@@ -15,7 +15,7 @@ from ..records import stored_trace_spec
 from .dataset import OWN, Dataset, Progress, expect_data, make_dataset, unit_text
 from .describe import describe
 from .description import FOLDER_FILE, Description, Stated
-from .read.files import as_source, find_files
+from .read.files import as_source
 from .read.recordings import read_recordings
 
 BUNDLED = {"insertion": "insertion.npz"}
@@ -49,9 +49,8 @@ def load_dataset(
         The channels to read, "FZ_Base" or "FZ_Base,FX_Base", among those that the description or
         the data set names. None: all channels.
     samples : int, optional
-        Number of samples of each trace: the rest is cut off at the end. If the description states
-        fewer samples, or none, or resamples the traces, this number replaces the one that it
-        states. None: as the description states, or as the data set is.
+        Number of samples of each trace: the rest is cut off at the end. None: as the description
+        states, or as the data set is.
     progress : callable, optional
         Called with 1 after each file that is read by a description; once for a bag or a table.
 
@@ -67,9 +66,9 @@ def load_dataset(
     DataError
         If the description is missing or has a key whose value is `?` (the message says what to
         type), if the source or a channel does not exist, if no recording is left, if `samples` is
-        below 1, or if traces that were read without a description are shorter than `samples`, or
-        longer although they were resampled. Also if none of the files can be read, a listing of
-        labels cannot, or the traces and labels do not fit together (`make_dataset`).
+        below 1, or if the traces are shorter than `samples`, or longer although they were
+        resampled. Also if none of the files can be read, a listing of labels cannot, or the traces
+        and labels do not fit together (`make_dataset`).
     SettingError
         If `windows.trigger` of the description, which cuts long recordings, is malformed.
     ValueError
@@ -87,10 +86,6 @@ def load_dataset(
         place = as_source(source)
         about = description_of(place, description)
         about = about.with_channels(names) if names else about
-        traces = about.traces
-        is_stated = isinstance(traces.samples, int) and traces.lengths != "resample"
-        if samples is not None and not (is_stated and samples <= traces.samples):
-            about = about.with_values({"traces.samples": samples})
         data = read_recordings(place, about, progress)
     return data if samples is None else data.cut(samples)
 
@@ -152,15 +147,6 @@ def description_of(
                 raise DataError(missing_text(source, proposal))
             return proposal
     return Description.load(description).with_values(stated or {})
-
-
-def count_files(source: str, description: Description | None) -> int:
-    """Return how many files of a source are read, for a progress bar.
-
-    It is 1 without a description; `source` is not looked at then. Raises DataError if the source
-    does not exist, the description fits no file, or one of its patterns is malformed.
-    """
-    return 1 if description is None else len(find_files(as_source(source), description))
 
 
 def missing_text(path: Path, proposal: Description) -> str:
@@ -272,9 +258,7 @@ def _read_npz(path: Path) -> Dataset:
     """
     arrays, _ = read_archive(path, OWN_ARRAYS)
     with read_errors(path, "an .npz file of plain arrays"):
-        X = arrays["X"]
-        if "scale" in arrays:
-            X = X.astype(np.float32) * arrays["scale"].astype(np.float32)
+        X = arrays["X"] * arrays.get("scale", np.ones(1)).astype(np.float32)
         units, channels = (
             [*map(str, np.atleast_1d(arrays.get(key, ())).tolist())] for key in ("unit", "channels")
         )

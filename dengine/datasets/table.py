@@ -108,12 +108,10 @@ class Table:
         point: 1.0 is "1". NaN and None are "". Raises UnreadableError if there is no such column,
         or its cells are lists.
         """
-        import pandas as pd
-
+        cells = self.column(name).tolist()
         with instead(UnreadableError, f"Expected texts or numbers in {name}", TypeError):
-            codes, cells = pd.factorize(self.column(name), use_na_sentinel=False)
-        texts = np.array([as_word(cell) for cell in cells.tolist()], dtype=object)
-        return np.asarray(texts[codes])
+            words = {cell: as_word(cell) for cell in {*cells}}
+        return np.array([words[cell] for cell in cells], dtype=object)
 
     def numbers(self, name: str, form: TextForm) -> Floats:
         """Return a column as numbers, float64 (rows,) or (1,); a missing number is NaN.

@@ -47,7 +47,7 @@ class Trigger:
     @property
     def signals(self) -> tuple[str, ...]:
         """Names of the signals that are read: `signal`, or `signal[0]` to `[2]` for motion."""
-        vector = (f"{self.signal}[0]", f"{self.signal}[1]", f"{self.signal}[2]")
+        vector = tuple(f"{self.signal}[{axis}]" for axis in range(3))
         return vector if self.kind == "motion" else (self.signal,)
 
     def active(self, signals: Mapping[str, Floats]) -> NDArray[np.bool_]:

@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 
 from ...errors import DataError, listed
-from ..checks import check_text
+from ..checks import check_forms
 from ..dataset import Fault
-from ..description import UNKNOWN, Description, flat
+from ..description import UNKNOWN, Clock, Description, flat
 from ..read.files import as_source, caught, match_files, natural_key, read_file
 from ..read.frames import read_frame
 from ..read.places import without_suffix
@@ -92,7 +92,7 @@ def describe(source: Any, stated: Stated | None = None) -> Description:
     source = as_source(source)
     stated = {key: value for key, value in flat("", stated or {}).items() if value != UNKNOWN}
     p = Proposal(stated, Description().with_values(stated))
-    check_text(p.description.text)
+    check_forms(Clock(), p.description.text)
     if not isinstance(source, Path):
         p.put("format", "frame")
         propose_tables(p, [read_frame(source, "table")])

@@ -7,7 +7,7 @@ import numpy as np
 
 from ...errors import listed
 from ...records import Floats
-from ..checks import check_clock
+from ..checks import check_forms
 from ..dataset import LEAST_RATE_HZ, MOST_RATE_HZ, Fault
 from ..description import ANY, UNKNOWN
 from ..read.clock import UNITS, check_steps, has_day, scale_of, times_of
@@ -200,20 +200,20 @@ def propose_rate(p: Proposal, tables: Tables) -> None:
     recordings than 10 % plus one, `time.gap` is set to `?`, with a note on the first. If all
     recordings start after 1999 (UTC), `order` is set to `time`, also if the rate is `?`. Recordings
     whose times cannot be read are skipped. Stated keys stay. Raises DataError if a stated format is
-    no form or unit of times, or if a setting in `[time]` is wrong (see `check_clock`).
+    no form or unit of times, or if a setting in `[time]` is wrong (see `check_forms`).
     """
     clock = p.description.time
-    check_clock(clock)
-    clocks = list[tuple[Table, Floats, float]]()
+    check_forms(clock, p.description.text)
+    clocks = list[tuple[Table, Floats]]()
     for table in tables:
         with suppress(UnreadableError):
-            clocks.append((table, *times_of(table, clock, p.description.text)))
-    if clocks and np.mean([seconds[-1:] < seconds[:1] for _, seconds, _ in clocks]) > 1 - FEW:
+            clocks.append((table, times_of(table, clock, p.description.text)))
+    if clocks and np.mean([seconds[-1:] < seconds[:1] for _, seconds in clocks]) > 1 - FEW:
         p.put("time.sort", True, "the newest row is the first")
     if p.description.time.sort:
-        clocks = [(table, np.sort(seconds), start) for table, seconds, start in clocks]
-    rising = [steps[steps >= 0] for steps in (np.diff(seconds) for _, seconds, _ in clocks)]
-    if min((start for *_, start in clocks), default=0.0) > YEARS[0]:
+        clocks = [(table, np.sort(seconds)) for table, seconds in clocks]
+    rising = [steps[steps >= 0] for steps in (np.diff(seconds) for _, seconds in clocks)]
+    if min((seconds[0] for _, seconds in clocks), default=0.0) > YEARS[0]:
         p.put("order", "time")
     usual = float(np.median([steps.mean() for steps in rising if len(steps)] or 0.0))
     if not is_rate(usual):
@@ -225,7 +225,7 @@ def propose_rate(p: Proposal, tables: Tables) -> None:
         return
     p.put("time.rate_hz", float(f"{1 / usual:.5g}"))
     faults = list[Fault]()
-    for table, seconds, _ in clocks:
+    for table, seconds in clocks:
         with caught(faults, table.source):
             check_steps(seconds, p.description.time, table)  # with the rate
     if len(faults) > FEW * len(clocks) + 1:

@@ -17,7 +17,7 @@ from ...errors import DataError
 from ...records import Floats
 from ..description import Clock, Description, TextForm
 from ..read.clock import ISO, times_of
-from ..read.split import column_kind
+from ..read.split import pattern_of, signals_of, word_columns
 from ..table import Table
 from ..units import bare, unit_in
 
@@ -209,5 +209,8 @@ class Proposal:
         Nor do signals of a trigger and the column of `order` count. Raises SettingError for a
         malformed `windows.trigger`.
         """
-        kind_of = column_kind(self.description)
-        return [column for name, column in self.columns.items() if not kind_of(name)]
+        about = self.description
+        used = {*word_columns(about), *about.time.column, *signals_of(about)}
+        for pattern in map(pattern_of, about.channels):
+            used.update(filter(pattern.fullmatch, self.columns))
+        return [column for name, column in self.columns.items() if name not in used]

@@ -197,10 +197,10 @@ def sources_of(p: Proposal, paths: Names) -> Iterator[LabelSource]:
 def words_of(p: Proposal, source: LabelSource, tables: Tables, parts: Words) -> Words:
     """Return the word of each recording that has one in a source, by its `Table.source`.
 
-    `tables` has the table of each recording, and `parts` their part numbers. If a listing has
-    several rows for a recording, it is the word of the first. If no recording has a word, also
-    because the source's listing cannot be read, or its `path` is no regular expression with one
-    group, DataError is raised for the stated source; any other then gives an empty mapping.
+    `tables` has the table of each recording, and `parts` their part numbers. A recording for which
+    a listing has rows with different words has none. If no recording has a word, also because the
+    source's listing cannot be read, or its `path` is no regular expression with one group,
+    DataError is raised for the stated source; any other then gives an empty mapping.
     """
     words = dict[str, str]()
     faults = list[Fault]()
@@ -208,7 +208,7 @@ def words_of(p: Proposal, source: LabelSource, tables: Tables, parts: Words) -> 
         reader = read_labels(p.base, source, p.description.text)
         for table in tables:
             with caught(faults, table.source):
-                words[table.source] = reader.words(table, parts.get(table.source, ""))[0]
+                words[table.source] = reader.word(table, parts.get(table.source, ""))
     if source == p.description.label and not words:
         raise DataError(f"Expected words where [label] says they stand, found none. {faults[0]}.")
     return words

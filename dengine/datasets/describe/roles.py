@@ -85,7 +85,7 @@ def set_rows(p: Proposal, rows: Mapping[str, RowWords]) -> None:
     tables = [table for table in p.tables if not is_dropped(table, certain)]
     for i, table in enumerate(tables):
         with suppress(DataError):
-            tables[i] = kept_rows(table, certain)[0]
+            tables[i] = kept_rows(table, certain)
     p.tables = tables
     p.columns = columns_of(tables, p.description.text)
 

@@ -7,24 +7,24 @@ another topic has in each row the newest `data` of that topic.
 
 import struct
 from collections.abc import Collection, Iterator, Sequence
-from operator import attrgetter, itemgetter
+from dataclasses import replace
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from ...errors import DataError, instead, listed
 from ...files import UNREADABLE, read_errors
 from ..dataset import Fault
 from ..description import Description
-from ..table import Cells, Table, UnreadableError
+from ..table import Table, UnreadableError
 from .files import caught
-from .frames import as_cells
+from .frames import read_frame
 from .split import signals_of, verdicts_of
 
 SUFFIX = ".mcap"
 STAMP = "stamp"
 LOG_TIME = "log_time"
+PLACE = "place"
 
 
 def read_messages(path: Path, topics: Collection[str] | None) -> Iterator[tuple[str, int, Any]]:
@@ -67,9 +67,9 @@ def read_bag(
     Its columns are the channels, `log_time`, the time of the log, and `stamp`, that in the
     message's header, 0 without one; both are in nanoseconds. Other topics that the description
     names are columns, too; a cell is the field `data` of a message. If a topic is a label, each of
-    its messages stands in the last row that is not later, other rows have None; of several messages
+    its messages stands in the last row that is not later, other rows have NaN; of several messages
     for one row the first stands there, and those before the first row are left out. Any other topic
-    has its newest message in each row, None before the first.
+    has its newest message in each row, NaN before the first.
 
     Parameters
     ----------
@@ -94,60 +94,43 @@ def read_bag(
     SettingError
         If the trigger is malformed.
     """
-    columns = [*description.channels]
-    topics = {column.partition(".")[0] for column in columns}
+    import pandas as pd
+
+    topics = {column.partition(".")[0] for column in description.channels}
     if len(topics) > 1:
         raise DataError(f"Expected channels of one topic, got {listed(sorted(topics))}.")
     verdicts = verdicts_of(description)
-    others = verdicts.union(description.part.column, signals_of(description), [description.order])
-    # by topic: nanoseconds of the log, data
-    events: dict[str, list[tuple[int, Any]]] = {
-        name: [] for name in others if name.startswith("/") and "." not in name
-    }
-    fields = [attrgetter(column.partition(".")[2]) for column in columns]
-    rows: list[Any] = []
+    others = {*description.part.column, *signals_of(description), description.order}
+    # Of messages at one time, a label counts for the row before it, any other for the row itself.
+    places = {name: 0 for name in others if name.startswith("/") and "." not in name}
+    places |= dict.fromkeys(verdicts, 2)
+    fields = {column: attrgetter(column.partition(".")[2]) for column in description.channels}
+    rows = list[dict[str, Any]]()
     for name in names:
         if description.windows.trigger and faults:
             raise DataError(
                 f"Expected whole files before {name}, since a trigger cuts: {faults[0]}"
             )
         with caught(faults, name), instead(UnreadableError, "Expected a field", AttributeError):
-            for topic, logged, message in read_messages(base / name, {*topics, *events}):
-                if topic in events:
-                    events[topic].append((logged, message.data))
+            for topic, logged, message in read_messages(base / name, {*topics, *places}):
+                if topic in places:
+                    rows.append({LOG_TIME: logged, PLACE: places[topic], topic: message.data})
                 if topic in topics:
-                    rows.append((logged, _stamp_of(message), *(field(message) for field in fields)))
-    if not rows:
+                    cells = {column: field(message) for column, field in fields.items()}
+                    rows.append({LOG_TIME: logged, PLACE: 1, STAMP: _stamp_of(message), **cells})
+    frame = pd.DataFrame(rows, columns=[LOG_TIME, PLACE, STAMP, *fields, *places])
+    frame = frame.sort_values([LOG_TIME, PLACE])
+    is_row = frame.pop(PLACE) == 1
+    if not is_row.any():
         why = f" {faults[0]}." if faults else ""
         raise DataError(f"Expected messages of {listed(topics)}, found none.{why}")
-    rows.sort(key=itemgetter(0))
-    cells = map(as_cells, zip(*rows, strict=True))
-    table = dict(zip((LOG_TIME, STAMP, *columns), cells, strict=True))
-    for topic, messages in events.items():
-        table[topic] = _cells_of(messages, table[LOG_TIME], topic in verdicts)
-    return Table(title, table, [])
+    for topic in places:
+        since_row = frame.groupby(is_row.cumsum())[topic]
+        frame[topic] = since_row.transform("first") if topic in verdicts else frame[topic].ffill()
+    return replace(read_frame(frame[is_row], title), lines=[])
 
 
 def _stamp_of(message: Any) -> int:
     """Return the time in a message's header, in nanoseconds; 0 without a header."""
     stamp = getattr(getattr(message, "header", None), "stamp", None)
     return stamp.sec * 10**9 + stamp.nanosec if stamp else 0
-
-
-def _cells_of(messages: list[tuple[int, Any]], logs: Cells, is_verdict: bool) -> Cells:
-    """Return the column of a topic, which has the data of a message or None for each row.
-
-    In each row stands the newest message so far, None before the first. But if `is_verdict`, the
-    messages are labels, and each stands only in the last row that is not later than it; of several
-    for one row the first stands there, and those before all rows are left out.
-
-    messages : (time in ns, data) of each message; they are sorted in place. logs : the times of the
-    rows in ns, increasing.
-    """
-    messages.sort(key=itemgetter(0))
-    times = [time for time, _ in messages]
-    words = [None, *(word for _, word in messages)]
-    places = np.searchsorted(times, logs, side="left" if is_verdict else "right")
-    if is_verdict:
-        places = np.where(np.diff(places, append=len(times)) > 0, places + 1, 0)
-    return as_cells([words[place] for place in places])

@@ -1,14 +1,13 @@
 """The times of samples, exactly as `[time]` says, and the check that none is missing."""
 
 import re
-from contextlib import suppress
 
 import numpy as np
 
 from ...errors import DataError, instead
 from ...records import Floats
 from ..description import Clock, TextForm
-from ..table import Cells, Table, UnreadableError
+from ..table import Table, UnreadableError
 
 UNITS = {"s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9}
 UNITS |= {"min": 60.0, "h": 3600.0, "d": 86400.0}
@@ -16,7 +15,6 @@ ISO = "iso"
 DAY = UNITS["d"]
 RATE_TOLERANCE = 0.03  # by which the rate of a recording's own times may differ from the stated one
 DATES = re.compile(r"%[dDjeyYxcmbB]")
-Times = tuple[Floats, float]  # the seconds of each row since the first, and the time of the first
 
 
 def is_dated(unit: str) -> bool:
@@ -49,8 +47,11 @@ def scale_of(unit: str) -> float:
     return float(match[1] or 1) * UNITS[match[2]]
 
 
-def times_of(table: Table, clock: Clock, form: TextForm) -> Times:
-    """Return the time of each row in seconds since the first row, and the time of the first row.
+def times_of(table: Table, clock: Clock, form: TextForm) -> Floats:
+    """Return the time of each row in seconds from the zero of the clock: the sum over its columns.
+
+    The zero is 1970 (UTC) for dates, and midnight for times of day. A float64 rounds a date to 0.24
+    microseconds.
 
     If times of day fall from one row to the next by more than half a day, midnight has passed,
     unless a column of the clock has the date. If a counter falls by more than half of `clock.wrap`,
@@ -61,7 +62,7 @@ def times_of(table: Table, clock: Clock, form: TextForm) -> Times:
     table : Table
         The rows of a recording.
     clock : Clock
-        The section `[time]`, which has passed `check_clock`. The times in its columns are added up;
+        The section `[time]`, which has passed `check_forms`. The times in its columns are added up;
         a column of one cell holds for all rows, and a column of datetimes needs no format. Without
         columns there is one time, 0.
     form : TextForm
@@ -71,9 +72,6 @@ def times_of(table: Table, clock: Clock, form: TextForm) -> Times:
     -------
     seconds : array of float64, shape (rows,)
         Shape (1,) if there is no column, or if each has but one cell.
-    start : float
-        In seconds, from the zero of the clock: 1970 (UTC) for dates, midnight for times of day,
-        and the sum over the columns.
 
     Raises
     ------
@@ -84,62 +82,52 @@ def times_of(table: Table, clock: Clock, form: TextForm) -> Times:
         If a format is no unit of time.
     """
     seconds: Floats = np.zeros(1)
-    start = 0.0
     for name, unit in zip(clock.column, clock.format, strict=True):
         cells = table.column(name)
         if not len(cells):
             raise UnreadableError("Expected times, got none", column=name)
-        is_date = cells.dtype.kind == "M"
-        if is_date or is_dated(unit):
-            values, first = _dates(table, name, unit, clock)
-            period = 0.0 if is_date or any(map(has_day, clock.format)) else DAY
+        unit = ISO if cells.dtype.kind == "M" else unit
+        if is_dated(unit):
+            values = _dates(table, name, unit, clock)
+            period = 0.0 if any(map(has_day, (unit, *clock.format))) else DAY
         else:
             scale = scale_of(unit)
-            times: Cells = table.numbers(name, form)
-            table.refuse(np.isnan(times), "a time", name)
-            with suppress(ValueError, OverflowError):
-                whole = cells.astype(np.int64)  # too long for a float, as nanoseconds are
-                times = whole if (whole == times).all() else times
-            values = (times - times[0]) * scale
-            first = float(times[0]) * scale
+            values = table.numbers(name, form) * scale
+            table.refuse(np.isnan(values), "a time", name)
             period = clock.wrap * scale
         if len({1, len(seconds), len(values)}) > 2:
             raise UnreadableError(f"Expected {len(seconds)} times, got {len(values)}", column=name)
-        begins_again = np.diff(values, prepend=0.0) < -period / 2
+        begins_again = np.diff(values, prepend=values[0]) < -period / 2
         seconds = seconds + (values + np.cumsum(begins_again) * period)
-        start += first
-    return seconds, start
+    return seconds
 
 
-def _dates(table: Table, name: str, unit: str, clock: Clock) -> Times:
-    """Return the times in a column of dates or times of day, and the time of its first row.
+def _dates(table: Table, name: str, unit: str, clock: Clock) -> Floats:
+    """Return the times in a column of dates or times of day.
 
-    The times are in seconds since the first row, and the time of the first row is in seconds since
-    1970 (UTC), or since midnight if the cells have no date. `unit` is the form of the cells, "iso"
-    or like "%d.%m.%Y"; a comma is read as a point. Dates without a time zone are in `clock.zone`,
-    or UTC if that is empty; times in the hour that comes twice need rows from both, in order.
-    Raises UnreadableError if there is no column `name`, or one of its cells does not have the form,
-    or is no single time because clocks are changed, or if the cells have several offsets from UTC.
+    They are in seconds since 1970 (UTC), or since midnight if the cells have no date. `unit` is the
+    form of the cells, "iso" or like "%d.%m.%Y"; a comma is read as a point. Dates without a time
+    zone are in `clock.zone`, or UTC if that is empty; times in the hour that comes twice need rows
+    from both, in order. Raises UnreadableError if there is no column `name`, or one of its cells
+    does not have the form, or is no single time because clocks are changed, or if the cells have
+    several offsets from UTC.
     """
     import pandas as pd
 
-    has_date = "%" not in unit or has_day(unit)
-    texts = pd.Series(table.column(name))
-    if texts.dtype.kind != "M":
-        texts = texts.astype(str).str.strip().str.replace(",", ".", regex=False)
-    form = unit.replace(",", ".") if "%" in unit else "ISO8601"
+    texts = pd.Series(table.column(name)).astype(str).str.strip()
+    texts = texts.str.replace(",", ".", regex=False)
+    form = "ISO8601" if unit == ISO else unit.replace(",", ".")
     with instead(
         UnreadableError, f"Expected times of the form {unit}", ValueError, AttributeError, re.error
     ):
         times = pd.to_datetime(texts, format=form, errors="coerce")
         if times.dt.tz is None:
-            zone = (has_date and clock.zone) or "UTC"
+            zone = (has_day(unit) and clock.zone) or "UTC"
             times = times.dt.tz_localize(zone, ambiguous="infer")
     table.refuse(times.isna().to_numpy(), f"a time of the form {unit}", name)
-    first = times.iloc[0]
-    zero = pd.Timestamp("1970-01-01" if has_date else "1900-01-01", tz="UTC")
-    values = (times - first).dt.total_seconds().to_numpy(np.float64)
-    return values, (first - zero).total_seconds()
+    zero = pd.Timestamp("1970-01-01" if has_day(unit) else "1900-01-01", tz="UTC")
+    seconds: Floats = (times - zero).dt.total_seconds().to_numpy(np.float64)
+    return seconds
 
 
 def check_steps(seconds: Floats, clock: Clock, table: Table) -> None:
@@ -163,7 +151,7 @@ def check_steps(seconds: Floats, clock: Clock, table: Table) -> None:
         row = int(is_bad.argmax()) + 1
         raise UnreadableError(
             f"Expected a later time, by at most time.gap steps, which are {most:.6g} s, got "
-            f"{steps[row - 1]:.6g} s before row {row + 1}",
+            f"{steps[row - 1]:.4g} s before row {row + 1}",
             table.line(row),
             column,
         )

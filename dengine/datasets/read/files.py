@@ -1,6 +1,5 @@
 """The files that a description names, their content, and how errors in them become faults."""
 
-import fnmatch
 import gzip
 import re
 import zlib
@@ -19,15 +18,15 @@ DATE = re.compile(r"(?<![0-9])([0-9]{2})\.([0-9]{2})\.([0-9]{4})(?![0-9])")
 BAD = (ValueError, NotImplementedError, OSError, IndexError)  # what an unusable pattern raises
 
 
-def natural_key(text: str) -> list[tuple[int, int, str]]:
+def natural_key(text: str) -> list[Any]:
     """Return a key that sorts runs of digits in texts by their size: run_2 before run_10.
 
     Decimals and signs do not count: 0.5 is before 0.25. Dates like 31.12.2025 are sorted by year,
     month and day.
     """
-    text = DATE.sub(r"\3.\2.\1", text)
-    pieces = re.split(r"([0-9]+)", text)
-    return [(1, int(p), "") if p.isascii() and p.isdecimal() else (0, 0, p) for p in pieces if p]
+    pieces: list[Any] = re.split(r"([0-9]+)", DATE.sub(r"\3.\2.\1", text))
+    pieces[1::2] = map(int, pieces[1::2])  # texts and numbers take turns
+    return pieces
 
 
 def as_source(source: Any) -> Any:
@@ -55,7 +54,9 @@ def match_files(root: Path, patterns: Sequence[str]) -> set[str]:
     The paths have `/` between folders. Folders that match are left out. Raises DataError for a
     malformed pattern.
     """
-    with instead(DataError, f"Expected patterns below a folder in files, got {patterns}", *BAD):
+    with instead(
+        DataError, f"Expected patterns below a folder in files and exclude, got {patterns}", *BAD
+    ):
         paths = [path for pattern in patterns for path in root.glob(pattern)]
     return {path.relative_to(root).as_posix() for path in paths if path.is_file()}
 
@@ -65,16 +66,13 @@ def find_files(root: Path, description: Description) -> list[str]:
 
     They are sorted by file name, run_2 before run_10. Listings, the description file and files that
     match a pattern in `exclude` are left out. If `root` is a file, its name alone is returned,
-    whatever the description says. Raises DataError if no file is left, or for a malformed pattern
-    in `files`.
+    whatever the description says. Raises DataError if no file is left, or for a malformed pattern.
     """
     if root.is_file():
         return [root.name]
     aside = {FOLDER_FILE, description.windows.listing}
     aside |= {source.listing for source in description.labels}
-    names = match_files(root, description.files) - aside
-    for pattern in description.exclude:
-        names -= {*fnmatch.filter(names, pattern)}
+    names = match_files(root, description.files) - match_files(root, description.exclude) - aside
     if not names:
         raise DataError(
             f"Expected files {', '.join(description.files)} in {root}, found none; is it the "

@@ -7,7 +7,6 @@ list of objects has a column for each of their keys.
 
 import io
 import json
-import re
 from collections.abc import Mapping
 from itertools import chain
 from typing import Any
@@ -187,11 +186,12 @@ def read_ts(content: bytes, source: str, form: TextForm) -> Table:
     Middlehurst et al. (2024), aeon: a Python toolkit for learning from time series, JMLR 25(289).
     """
     text = to_utf8(content, form.encoding).decode()
-    head, *below = re.split(r"(?im)^[ \t]*@data[ \t]*$", text, maxsplit=1)
     rows: Rows = []
-    for number, line in enumerate("".join(below).split("\n"), head.count("\n") + 1):
-        if line.strip():
-            *series, label = line.strip().split(":")
+    is_data = False
+    for number, line in enumerate(map(str.strip, text.split("\n")), 1):
+        if is_data and line:
+            *series, label = line.split(":")
             channels = {str(c): cells.split(",") for c, cells in enumerate(series)}
             rows.append((number, {**channels, "class": label}))
+        is_data |= line.lower() == "@data"
     return _table_of(source, rows, "series below a line @data")

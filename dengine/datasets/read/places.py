@@ -68,10 +68,11 @@ def line_word(lines: Sequence[str], beginning: str) -> str:
 
     lines : the lines above the header of a file.
     """
-    texts = [line.lstrip(f"#%*{MARKS}") for line in lines]
-    texts = [text[len(beginning) :] for text in texts if text.startswith(beginning)]
-    whole = [text for text in texts if re.match(r"[\"' ]*([;:：=\t,]|  |$)", text)]
-    words = {re.split(r"[;\t,]", text.strip(MARKS))[0].strip(MARKS) for text in whole or texts}
+    words: set[str] = set()
+    for end in ("(?=[\"' ]*([;:：=\t,]|  |$))", ""):
+        pattern = f"(?m)^[#%*{MARKS}]*{re.escape(beginning)}{end}[{MARKS}]*(?P<word>[^;\t,\n]*)"
+        found = re.finditer(pattern, "\n".join(lines))
+        words = words or {match["word"].rstrip(MARKS) for match in found}
     if len(words) != 1:
         wanted = f"one word behind {beginning} in the lines above the header"
         raise UnreadableError(f"Expected {wanted}, got {listed(words) or 'no such line'}")
@@ -144,35 +145,35 @@ def in_listing(name: str) -> Iterator[None]:
 class LabelReader:
     """Finds the label of a recording in one source.
 
-    listing : the words by key, if the source is a listing. used : the keys that were found in it,
-    each with the path of the first recording that has it.
+    listing : the different words by key, if the source is a listing. used : the keys that were
+    found in it, each with the path of the first recording that has it.
     """
 
     source: LabelSource
-    listing: Mapping[str, Sequence[str]]
+    listing: Mapping[str, set[str]]
     used: dict[str, str] = field(default_factory=dict)
 
-    def words(self, table: Table, part: str) -> Sequence[str]:
-        """Return the words that stand for the label of a recording, like "ok".
+    def word(self, table: Table, part: str) -> str:
+        """Return the word that stands for the label of a recording, like "ok".
 
         `table` is the table of the recording, and `part` its part number. If the source is a
-        listing, they are the words of all its rows with the key of the recording. The key is the
+        listing, it is the word of all its rows with the key of the recording. The key is the
         first of these that is listed: the number of the part, the path, the file name, the path
-        without suffix, the file name without suffix. It is added to `used`, the keys found so
-        far. Any other source gives one word.
+        without suffix, the file name without suffix. It is added to `used`, the keys found so far.
 
         Raises
         ------
         UnreadableError
-            If there are no words for the recording, or if its rows have different ones and
-            `source.at` is "same". If the key, a file's name, was found for another path before.
+            If there is no word for the recording, if rows of the listing have different ones, or if
+            the recording's own rows have and `source.at` is "same". If the key, a file's name, was
+            found for another path before.
         DataError
             If `source.path` is no regular expression with one group.
         """
         source = self.source
         path = table.path
         if not source.listing:
-            return words_of(source, table, [source.column or source.topic], source.at)
+            return words_of(source, table, [source.column or source.topic], source.at)[0]
         name = path.rpartition("/")[2]
         names = filter(None, (part, path, name, without_suffix(path), without_suffix(name)))
         keys = [key for key in map(as_key, names) if key in self.listing]
@@ -181,12 +182,16 @@ class LabelReader:
                 f"Expected {part or name} in {source.listing}, it is not listed; it has "
                 f"{listed(sorted(self.listing)[:2])}; if its name contains the key, state part.path"
             )
-        if self.used.setdefault(keys[0], path) != path and keys[0] != as_key(part):
+        key = keys[0]
+        if self.used.setdefault(key, path) != path and key != as_key(part):
             raise UnreadableError(
-                f"Expected a row of {source.listing} for each file, {keys[0]} also names "
-                f"{self.used[keys[0]]}"
+                f"Expected one file for {key} in {source.listing}, got {self.used[key]} before"
             )
-        return self.listing[keys[0]]
+        words = sorted(self.listing[key])
+        if len(words) > 1:
+            message = f"Expected one label for {part or path}, got {listed(words)}"
+            raise UnreadableError(message, column=source.column)
+        return words[0]
 
     def label(self, table: Table, part: str) -> int | None:
         """Return the label of a recording: 1 good, 0 bad, None not checked.
@@ -194,23 +199,19 @@ class LabelReader:
         `table` is the table of the recording, and `part` its part number. If the source is a
         listing, the key that was found in it is added to `used`, the keys found so far.
         Words are compared exactly; a word that is stated for several meanings is good before bad,
-        and bad before not checked. Raises UnreadableError if there is no label, if rows of the
-        listing contradict each other, if the recording's own rows have different words while
-        `source.at` is "same", or if a word has no stated meaning, and DataError if `source.path` is
-        no regular expression with one group.
+        and bad before not checked. Raises UnreadableError if there is no word or several (see
+        `word`), or if it has no stated meaning, and DataError if `source.path` is no regular
+        expression with one group.
         """
         source = self.source
-        meanings = source.meanings
-        words = self.words(table, part)
-        fault = ""
-        if unknown := [word for word in words if word not in meanings]:
-            fault = f"Expected a label among {listed(meanings)}, got {shortened(unknown[0])}"
-        elif len({meanings[word] for word in words}) > 1:
-            fault = f"Expected one label for {part or table.path}, got {listed(sorted(words))}"
-        if fault:
-            line = 0 if source.listing or source.path else table.line(0)
-            raise UnreadableError(fault, line, source.column)
-        return meanings[words[0]]
+        word = self.word(table, part)
+        if word not in source.meanings:
+            raise UnreadableError(
+                f"Expected a label among {listed(source.meanings)}, got {shortened(word)}",
+                0 if source.listing or source.path else table.line(0),
+                source.column,
+            )
+        return source.meanings[word]
 
     def unused_note(self) -> str:
         """Return a sentence on rows of the listing that name no recording, "" if there is none.
@@ -241,12 +242,12 @@ def read_labels(base: Path, source: LabelSource, form: TextForm) -> LabelReader:
     """Return the reader of a source of labels, after reading its listing, if it has one.
 
     The listing stands in the folder `base`, and is a text in the encoding of `form` or a Parquet
-    file. Rows of one key stay together, in their order. Raises DataError if it cannot be read, or
+    file. Raises DataError if it cannot be read, or
     if `source.key` and `source.column`, the columns of keys and words in it, are not both stated
     and there, and LookupError for an encoding that Python does not know. Whether `source.path` is a
     regular expression is not checked here.
     """
-    listing = defaultdict[str, list[str]](list)
+    listing = defaultdict[str, set[str]](set)
     if source.listing:
         columns = (source.key, source.column)
         if not all(columns):
@@ -254,5 +255,5 @@ def read_labels(base: Path, source: LabelSource, form: TextForm) -> LabelReader:
         with in_listing(source.listing):
             table = listing_table(base / source.listing, form)
             for key, word in zip(*map(table.words, columns), strict=True):
-                listing[as_key(key)].append(word)
+                listing[as_key(key)].add(word)
     return LabelReader(source, listing)

@@ -18,7 +18,7 @@ from ...traces import can_fit_length, fit_length
 from ..checks import check_description, without_repeats
 from ..dataset import Dataset, Fault, make_dataset, unit_text
 from ..description import ANY, ORDERS, Channel, Description, RowWords, TextForm
-from ..table import Cells, Recording, Table, UnreadableError, as_word
+from ..table import Recording, Table, UnreadableError, as_word
 from ..units import bare, conversion, unit_in
 from .bags import read_bag
 from .clock import check_steps, times_of
@@ -29,7 +29,7 @@ from .split import split, table_of
 from .windows import cut
 
 FRAME = "table"  # what a DataFrame is called in messages
-ROUNDING = 1e-6  # of a step: sums of float64 miss a time by less
+ROUNDING = 0.01  # of a step: float64 misses a date by less
 WORDS = {1: "good", 0: "bad", None: "not checked"}
 
 
@@ -64,25 +64,24 @@ def recording_of(
     clock = description.time
     form = description.text
     order = description.order
-    table, is_lost = kept_rows(table.whole(), description.rows)
+    table = kept_rows(table.whole(), description.rows)
     seconds = None
     rank: Any = ""
     if clock.column:
-        seconds, start = times_of(table, clock, form)
+        seconds = times_of(table, clock, form)
         if clock.sort:
             rows = np.argsort(seconds, kind="stable")
             table = table.take(rows)
-            is_lost = is_lost[rows]
-            seconds, start = times_of(table, clock, form)
+            seconds = seconds[rows]
         check_steps(seconds, clock, table)
-        rank = start if order == "time" else rank
+        rank = seconds[0] if order == "time" else rank
     samples = [samples_of(table, *item, form) for item in description.channels.items()]
     lengths = [*map(len, samples if seconds is None else [*samples, seconds])]
     if len({*lengths}) > 1:
         raise UnreadableError(f"Expected channels and times of one length, got {lengths}")
-    if description.rows:
-        for values in samples:
-            values[is_lost] = np.nan
+    for column, about in description.rows.items():
+        is_lost = np.array(about.kinds(table.words(column))) == "invalid"
+        samples = [np.where(is_lost, np.nan, values) for values in samples]
     part = part_of(description.part, table)
     if not part and description.is_cut:
         part = table.path
@@ -98,29 +97,23 @@ def recording_of(
 
 
 @instead(UnreadableError, "Expected columns of one length", IndexError, ValueError)
-def kept_rows(table: Table, rows: Mapping[str, RowWords]) -> tuple[Table, Cells]:
-    """Return a table of the rows that are samples, and which of these are lost, bool (kept rows,).
+def kept_rows(table: Table, rows: Mapping[str, RowWords]) -> Table:
+    """Return a table of the rows that are samples, lost ones too.
 
-    A column takes its words from the rows that the columns before it keep. Without `rows` all are
-    kept. Raises UnreadableError for a word whose meaning is not stated, and for a column that is
-    missing, has lists or is of another length.
+    A column takes its words from the rows that the columns before it keep; one of a single cell
+    drops no rows. Raises UnreadableError for a word whose meaning is not stated, and for a column
+    that is missing, has lists or is of another length.
 
     rows : for each column, the words that keep a row, drop it, or mark its samples as lost; `*` is
     any other word.
     """
-    n = max(map(len, table.columns.values()), default=0)
-    is_lost: Cells = np.zeros(n, dtype=bool)
     for column, about in rows.items():
-        words = table.words(column)
-        kind_of = {word: about.kind(word) for word in {*words}}
-        kind = np.array([kind_of[word] for word in words], dtype=object)
+        kinds = np.array(about.kinds(table.words(column)), dtype=np.str_)
         wanted = f"one of the words {listed(sorted(about.keep + about.drop + about.invalid))}"
-        table.refuse(kind == "", wanted, column)
-        kind = np.broadcast_to(kind, is_lost.shape)  # one cell holds for all rows
-        is_kept = kind != "drop"
-        is_lost = (is_lost | (kind == "invalid"))[is_kept]
-        table = table.take(is_kept)
-    return table, is_lost
+        table.refuse(kinds == "", wanted, column)
+        if len(kinds) > 1:
+            table = table.take(kinds != "drop")
+    return table
 
 
 def samples_of(table: Table, column: str, channel: Channel, form: TextForm) -> Floats:
@@ -155,15 +148,15 @@ def label_of(labels: Sequence[LabelReader], table: Table, part: str) -> int | No
     only one of them says that it was not checked, and DataError if the path of a source is no
     regular expression with one group.
     """
-    label, *others = [reader.label(table, part) for reader in labels]
-    for i, other in enumerate(others, 1):
-        if other != label:
+    found = [reader.label(table, part) for reader in labels]
+    for i, label in enumerate(found):
+        if label != found[0]:
             raise UnreadableError(
-                f"Expected labels that agree, [label] says {WORDS[label]}, [[check]] {i} says "
-                f"{WORDS[other]}",
+                f"Expected labels that agree, [label] says {WORDS[found[0]]}, [[check]] {i} says "
+                f"{WORDS[label]}",
                 column=labels[i].source.column,
             )
-    return label
+    return found[0]
 
 
 def read_recordings(
@@ -283,9 +276,11 @@ def is_dropped(part: Table, rows: Mapping[str, RowWords]) -> bool:
 
     So has a row of a wide table with the samples of another signal.
     """
-    cells = {name: part.columns[name] for name in rows if name in part.columns}
-    words = {name: as_word(cell[0]) for name, cell in cells.items() if len(cell) == 1}
-    return any(rows[name].kind(word) == "drop" for name, word in words.items())
+    for name in rows.keys() & part.columns.keys():
+        cells = part.columns[name]
+        if len(cells) == 1 and rows[name].kinds([as_word(cells[0])]) == ["drop"]:
+            return True
+    return False
 
 
 def dataset_of(recordings: Sequence[Recording], description: Description) -> Dataset:
@@ -324,7 +319,7 @@ def dataset_of(recordings: Sequence[Recording], description: Description) -> Dat
 def fitted(samples: Floats, seconds: Floats | None, description: Description) -> TraceArray:
     """Return the trace (C, T) of samples (C, n), brought to T samples as `[traces]` says.
 
-    `seconds`, shape (n,), has the times since the first sample; None without a clock. With
+    `seconds`, shape (n,), has the times of the samples; None without a clock. With
     `resample`, times and a stated rate, the samples are interpolated at that rate from the first
     time on. A longer recording loses its end; one that ends up to one step early is accepted, and
     its last sample repeated. With times but without a rate the whole recording is interpolated
@@ -343,6 +338,7 @@ def fitted(samples: Floats, seconds: Floats | None, description: Description) ->
     kind = FITS.index(about.lengths.removesuffix("-all"))
     can_fit = can_fit_length(n, about.samples, kind) or (about.lengths == "pad-all" and n > 0)
     if about.lengths == "resample" and seconds is not None:
+        seconds = seconds - seconds[0]
         times = np.linspace(0, seconds[-1], about.samples)
         if rate:
             times = np.arange(about.samples) / rate

@@ -13,7 +13,7 @@ from ..table import Cells, Table, UnreadableError, as_word
 from ..triggers import as_trigger
 from . import frames
 from .clock import is_dated
-from .text import NUMBER, WORD, Kind, read_text
+from .text import read_text
 
 NUMBERED = r"(\d+(?:\.\d+)?(?:e-?\d+)?)"  # for which `*` stands in a wide table: `F*` is not `Fmax`
 OBJECTS = ("json", "jsonl", "ts")
@@ -25,8 +25,7 @@ def table_of(content: bytes, name: str, description: Description) -> Table:
     Any other format than `ts`, `json`, `jsonl`, `parquet` and `npz` is read as text. `content` has
     the bytes of the file, and `name` is its name in errors. Raises UnreadableError or DataError if
     the file does not have this format, and DataError without pyarrow for a Parquet file. Raises
-    LookupError for an encoding that Python does not know, and for a text file SettingError if
-    `windows.trigger` is malformed.
+    LookupError for an encoding that Python does not know.
     """
     kind = description.format
     form = description.text
@@ -38,34 +37,19 @@ def table_of(content: bytes, name: str, description: Description) -> Table:
         return frames.read_parquet(content, name)
     if kind == "npz":
         return frames.read_npz(content, name, description.layout == "npz")
-    return read_text(content, name, form, column_kind(description))
+    return read_text(content, name, form, word_columns(description))
 
 
-def column_kind(description: Description) -> Kind:
-    """Return a function from a column's name to its kind: "number", "word", or "" if not needed.
+def word_columns(description: Description) -> set[str]:
+    """Return the columns whose cells are read as words, also if they are channels, too.
 
-    Words are dates, part numbers, labels, the column of `order` and those in `[rows]`, also if they
-    are channels, too. Numbers are other columns of channels, of times, and of the signals of the
-    trigger. A column that the description does not name so is not needed. Raises SettingError if
-    `windows.trigger` is malformed.
+    These are dates, part numbers, labels, the column of `order` and those in `[rows]`.
     """
     clock = description.time
     forms = zip(clock.column, clock.format, strict=False)
-    dated = {name for name, form in forms if is_dated(form)}
-    order = {description.order} - ORDERS
-    words = dated.union(description.part.column, description.rows, order)
-    words |= {source.column for source in description.labels}
-    numbers = {*clock.column, *signals_of(description)}
-    patterns = [*map(pattern_of, description.channels)]
-
-    def kind_of(name: str) -> str:
-        """Return "word", "number" or "" for the column of this name; "word" if both fit."""
-        if name in words:
-            return WORD
-        is_channel = any(pattern.fullmatch(name) for pattern in patterns)
-        return NUMBER if is_channel or name in numbers else ""
-
-    return kind_of
+    words = {name for name, form in forms if is_dated(form)}
+    words.update(description.part.column, description.rows, {description.order} - ORDERS)
+    return words.union(source.column for source in description.labels)
 
 
 def signals_of(description: Description) -> Sequence[str]:
@@ -163,45 +147,39 @@ def _split_wide(table: Table, description: Description) -> Iterator[Table]:
     A channel like `x*` gets its samples from the columns in which a number stands for the `*`, in
     the order of these numbers, without empty cells at the end. A list in any other cell becomes a
     column, or several; a column without a cell for each row is in every part as a whole, and an
-    empty one in none. A part has damage if its row had a wrong number of cells, or if the items of
-    a list in it are not all alike; then it has only its numbered channels.
-    """
-    groups: dict[str, list[str]] = {}
-    curves: frames.Columns = {}
-    units = {**table.units}
-    for key in description.channels:
-        names = [match[0] for match in match_numbered(key, table.columns)]
-        if ANY in key and names:
-            groups[key] = names
-            curves[key] = np.stack([*map(table.column, names)], axis=1)
-            units[key] = units.get(names[0], "")
-    used = {*chain(*groups.values())}
-    others = {name: c for name, c in table.columns.items() if len(c) and name not in used}
-    rest = replace(table, columns=others, units=units, origin=groups)
-    for i in range(len(table.lines)):
-        part = _row_of(rest, i)
-        samples = {key: without_empty_end(rows[i]) for key, rows in curves.items()}
-        yield replace(part, columns={**part.columns, **samples})
-
-
-def _row_of(table: Table, i: int) -> Table:
-    """Return row i as the table of a part; a list in a cell becomes a column, or several.
-
-    A column that does not have a cell for each row is taken as a whole. The part has damage if the
-    row had a wrong number of cells. If the items of a list in a cell are not all alike, that is its
-    only damage, and it has no columns.
+    empty one in none. A part has damage if its row had a wrong number of cells. If the items of a
+    list in it are not all alike, that is its only damage, and it has no columns.
     """
     n = len(table.lines)
-    line = table.lines[i]
-    source = f"{table.source}, row {line or i + 1}" if n > 1 else table.source
-    damage = [error for error in table.damage if error.line == line]
-    row = {name: cells[i] if len(cells) == n else cells for name, cells in table.columns.items()}
-    columns: frames.Columns = {}
-    try:
-        columns = frames.columns_of("", row)
-    except UnreadableError as error:
-        damage = [error]
-    return replace(table, source=source, columns=columns, lines=[line], damage=damage)
+    origin: dict[str, list[str]] = {}
+    units = {**table.units}
+    cells = {name: column for name, column in table.columns.items() if len(column)}
+    for key in filter(lambda key: ANY in key, description.channels):
+        if names := [match[0] for match in match_numbered(key, table.columns)]:
+            origin[key] = names
+            units[key] = units.get(names[0], "")
+            cells[key] = np.stack([*map(table.column, names)], axis=1)
+    for name in chain(*origin.values()):
+        cells.pop(name, None)
+    for i, line in enumerate(table.lines):
+        row = {name: column[i] if len(column) == n else column for name, column in cells.items()}
+        damage = [error for error in table.damage if error.line == line]
+        columns: frames.Columns = {}
+        try:
+            columns = frames.columns_of("", row)
+        except UnreadableError as error:
+            damage = [error]
+        columns |= {key: without_empty_end(columns[key]) for key in origin if key in columns}
+        source = f"{table.source}, row {line or i + 1}" if n > 1 else table.source
+        yield replace(
+            table,
+            source=source,
+            columns=columns,
+            lines=[line],
+            units=units,
+            damage=damage,
+            origin=origin,
+        )
 
 
 def match_numbered(key: str, columns: Iterable[str]) -> list[re.Match[str]]:

@@ -4,12 +4,10 @@ pandas' C parser reads plain files. Where it meets anything odd, the standard `c
 file again, and names the cell that does not fit.
 """
 
-import codecs
 import csv
 import io
 import re
-import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Container, Sequence
 from contextlib import suppress
 from dataclasses import replace
 
@@ -21,12 +19,11 @@ from ..table import Table, UnreadableError
 COMMENT = re.compile(r"^[#%]+\s*")
 BLANK = " "
 REST = "*"  # at the end of the last name: it stands for all columns that remain
-NUMBER = "number"  # kinds of columns
-WORD = "word"
-Kind = Callable[[str], str]
 
 
-def read_text(content: bytes, source: str, form: TextForm, kind_of: Kind = lambda _: WORD) -> Table:
+def read_text(
+    content: bytes, source: str, form: TextForm, words: Container[str] | None = None
+) -> Table:
     """Return the table of a text file.
 
     Parameters
@@ -37,11 +34,10 @@ def read_text(content: bytes, source: str, form: TextForm, kind_of: Kind = lambd
         Name of the file, for errors.
     form : TextForm
         How the file is written: the section `[text]`.
-    kind_of : callable
-        Returns the kind of a column by its name; by default "word". "number": the column has
-        numbers if the file is plain, otherwise texts. "word": it has texts. "": it is not needed,
-        and is empty if the file is plain. A file is plain if pandas can read it without doubt, and
-        `form.drop` is empty.
+    words : container of str, optional
+        The columns whose cells are read as texts. The cells of any other column are numbers if the
+        file is plain and pandas reads them all as numbers, otherwise texts. A file is plain if
+        pandas can read it without doubt, and `form.drop` is empty. None: all columns.
 
     Returns
     -------
@@ -75,7 +71,7 @@ def read_text(content: bytes, source: str, form: TextForm, kind_of: Kind = lambd
     columns = dict.fromkeys(names, np.empty(0))
     lines = np.arange(first, end)
     table = Table(source, columns, lines, stated, top[: (header or first) - 1], header)
-    return _read_plain(content, table, form, kind_of) or _read_strictly(content, table, form)
+    return _read_plain(content, table, form, words) or _read_strictly(content, table, form)
 
 
 def to_utf8(content: bytes, encoding: str) -> bytes:
@@ -85,11 +81,8 @@ def to_utf8(content: bytes, encoding: str) -> bytes:
     encoding does not say where), if a byte does not fit the encoding or if the text has a zero, and
     LookupError for an encoding that Python does not know.
     """
-    is_utf8 = codecs.lookup(encoding).name == "utf-8"
     try:
-        if not (is_utf8 and content.isascii()):
-            text = content.decode(encoding).removeprefix("\ufeff")
-            content = text.encode("utf-8", "replace")
+        content = content.decode(encoding).removeprefix("\ufeff").encode("utf-8", "replace")
         bad = content.find(b"\0")
     except UnicodeError as error:  # some encodings do not say where
         bad = getattr(error, "start", 0)
@@ -158,49 +151,46 @@ def _names(top: Sequence[str], header: int, form: TextForm) -> list[str]:
     return names
 
 
-def _read_plain(content: bytes, table: Table, form: TextForm, kind_of: Kind) -> Table | None:
-    """Return the table with its needed columns, read by pandas; None if the file is not plain.
+def _read_plain(
+    content: bytes, table: Table, form: TextForm, words: Container[str] | None
+) -> Table | None:
+    """Return the table with its columns, read by pandas; None if the file is not plain.
 
-    Not plain are a row with a wrong number of cells, an empty line, an empty last cell, a cell with
-    a line break, and one that is not a finite number in a column of numbers, like an empty one; nor
-    is a file of which `form.drop` leaves out lines, or in which a number means a lost sample.
+    Not plain are a row with a wrong number of cells, an empty line, an empty last cell, and a cell
+    with a line break; nor is a file of which `form.drop` leaves out lines, or in which a number
+    means a lost sample. A column that pandas does not read as numbers has texts.
 
-    table : has the names of the columns, which are empty, and the lines of the rows. kind_of :
-    returns the kind of a column: "number", "word" (its cells are read as texts), or "" if it is not
-    needed and stays empty.
+    table : has the names of the columns, which are empty, and the lines of the rows. words : the
+    columns whose cells are read as texts; None: all.
     """
     import pandas as pd
 
     if form.drop or any(word[-1:].isdigit() for word in form.missing):
         return None
-    kinds = {name: kind_of(name) for name in table.columns}
+    texts = [name for name in table.columns if words is None or name in words]
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", pd.errors.DtypeWarning)
-            frame = pd.read_csv(
-                io.BytesIO(content),
-                sep=r"\s+" if form.delimiter == BLANK else form.delimiter,
-                header=None,
-                skiprows=table.lines[0] - 1,
-                names=[*kinds],
-                decimal=form.decimal,
-                dtype={name: "category" for name, kind in kinds.items() if kind == WORD},
-                keep_default_na=False,
-            )
+        frame = pd.read_csv(
+            io.BytesIO(content),
+            sep=r"\s+" if form.delimiter == BLANK else form.delimiter,
+            header=None,
+            skiprows=table.lines[0] - 1,
+            names=[*table.columns],
+            decimal=form.decimal,
+            dtype=dict.fromkeys(texts, "category"),
+            keep_default_na=False,
+            low_memory=False,  # so a column has numbers or texts, not both
+        )
     except (ValueError, OverflowError):  # a row of too many cells, among others
         return None
     is_whole = len(frame) == len(table.lines) and isinstance(frame.index, pd.RangeIndex)
     if not is_whole or frame.iloc[:, -1].isin(["", np.nan]).any():  # the end of a cut row
         return None
     columns = {**table.columns}
-    for name, kind in kinds.items():
-        cells = frame[name]
-        if kind == WORD:  # equal words are one object
+    for name, cells in frame.items():
+        if name in texts:  # equal words are one object
             columns[name] = np.array(cells.array.categories, dtype=object)[cells.array.codes]
-        elif kind == NUMBER:
+        else:
             columns[name] = cells.to_numpy()
-            if cells.dtype.kind not in "iuf" or not np.isfinite(columns[name]).all():
-                return None
     return replace(table, columns=columns)
 
 

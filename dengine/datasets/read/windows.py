@@ -12,7 +12,6 @@ from ..description import Clock, Description
 from ..table import Table, UnreadableError
 from ..triggers import StartFinder, as_trigger
 from .clock import times_of
-from .frames import as_cells
 from .places import in_listing, listing_table
 from .split import verdicts_of
 
@@ -37,12 +36,14 @@ def cut(table: Table, description: Description, base: Path) -> Iterator[Table]:
     cannot be read, SettingError for a malformed trigger, and LookupError for a listing in an
     encoding that Python does not know.
     """
+    import pandas as pd
+
     name = table.source
     if not description.time.column:
         raise DataError(f"Expected time.column, the clock of {name}, which is one long recording.")
-    seconds, start = times_of(table.whole(), description.time, description.text)
+    times = times_of(table.whole(), description.time, description.text)
     find = _triggered if description.windows.trigger else _listed
-    windows = [*find(table, seconds + start, description, base)]
+    windows = [*find(table, times, description, base)]
     if not windows:
         raise DataError(f"Expected parts in {name}, found none; see [windows].")
     ends = [*(rows.start for _, rows, _ in windows[1:]), None]
@@ -51,7 +52,7 @@ def cut(table: Table, description: Description, base: Path) -> Iterator[Table]:
         verdicts = {}
         for topic in verdicts_of(description):
             words = table.column(topic)[rows.start : end]
-            verdicts[topic] = as_cells([word for word in words if word is not None][:1])
+            verdicts[topic] = words[pd.notna(words)][:1]
         yield replace(
             part,
             source=f"{name}, {key}",
@@ -108,19 +109,18 @@ def _listed(table: Table, times: Floats, description: Description, base: Path) -
         keys = listing.words(about.key)
         for column in (about.start, about.end):
             clock = Clock((column,), (about.format,), description.time.zone)
-            seconds, start = times_of(listing, clock, form)
-            bounds.append(seconds + (start - TOLERANCE))
+            bounds.append(times_of(listing, clock, form) - TOLERANCE)
     zero = times[0] if bounds[1].max() < EPOCH <= times[0] else 0.0
     begins, ends = np.array(bounds) + zero
     margin = 1.5 / (description.time.rate_hz or np.inf) + TOLERANCE
-    latest = -np.inf
+    least = times[0] - margin
     for begin, end, key in sorted(zip(begins, ends, keys.tolist(), strict=True)):
         rows = np.flatnonzero((times >= begin) & (times < end))
         fault = ""
-        if begin < latest - TOLERANCE:
-            fault = "Expected windows apart, it overlaps the one before"
-        elif not len(rows) or begin < times[0] - margin or end > times[-1] + margin:
-            fault = "Expected samples in the whole window, it has none or goes beyond the recording"
-        latest = max(latest, end)
-        window = slice(rows[0], rows[-1] + 1) if len(rows) else slice(1)
-        yield key, window, fault
+        if not len(rows) or begin < least or end > times[-1] + margin:
+            fault = (
+                "Expected samples in the whole window, it has none, goes beyond the recording or "
+                "overlaps the window before"
+            )
+        least = max(least, end - TOLERANCE)
+        yield key, slice(rows[0], rows[-1] + 1) if len(rows) else slice(1), fault
