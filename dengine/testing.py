@@ -214,8 +214,9 @@ def a_version_answers_as_it_was_trained(reducer: Any) -> None:
     one that was compiled for the first, with weights of its own. The reference points must be
     finite. For eight of the traces, a reducer that is restored from the trained one's state, or
     without a state the trained one itself, must give the same points again, two times, within 1e-5
-    times (1 + the coordinate). So must, within 1e-3 and unless it finds a fault, the model's
-    decider, for each trace alone as in a cell: it runs the reducer's `module()`, compiled to
+    times (1 + the coordinate's absolute value). So must the model's decider, for each trace alone
+    as in a cell, unless it finds a fault in the trace: within 1e-3 in place of 1e-5, after points
+    are divided by the scale of their space. It runs the reducer's `module()`, compiled to
     TorchScript, or `embed` if that is None. If the module does not compile or run, TorchScript's
     own error is raised. `reducer` may be unfitted and stays unchanged.
     """

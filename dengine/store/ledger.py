@@ -156,7 +156,7 @@ def check_key(connection: sa.Connection, cell_id: str, key: bytes, begin: bool =
         b"" for a ledger without a key.
     begin : bool, default False
         If the cell has no ledger entry and no key yet, store a setting by which this key is
-        recognized later (a keyed digest, not the key); nothing for b"".
+        recognized later (a keyed digest, not the key), without a commit; nothing for b"".
 
     Raises
     ------
@@ -186,7 +186,8 @@ def newest_entry(connection: sa.Connection, cell_id: str) -> Any:
     """Return a row (number, digest, chains) of a cell's newest ledger entry; None if it has none.
 
     `digest` is 32 bytes. `chains` is JSON: by the name of each table that an engine reads at its
-    start, the table's chain, a digest over all rows that it has so far.
+    start, the table's chain, a digest over all rows that it has so far (of the settings, over the
+    present ones). A table that never had a row is missing there.
     """
     return connection.execute(
         sa.select(*LEDGER.c["number", "digest", "chains"])
@@ -308,9 +309,10 @@ class LedgerEntry:
     def append(self, clock: Clock) -> EntryName | None:
         """Insert the entry into the ledger, as the transaction's last step; this does not commit.
 
-        The entry has the numbers of the added rows by table, a digest over their checksums, the
-        chains of the tables in `IN_FORCE` extended by them, and a digest over all this and the
-        entry before. If settings were written, it also has a copy of all settings of the engine.
+        The entry says how many rows were added to each table. It has a digest over their checksums,
+        the chains, extended by them, of the tables that an engine reads at its start (`IN_FORCE`),
+        and a digest over all this and the entry before. If settings were written, it also has a
+        copy of all settings of the engine.
 
         Parameters
         ----------
@@ -351,7 +353,9 @@ def find_integrity_error(connection: sa.Connection, cell_id: str, key: bytes, fi
     """Compare the rows of a cell that an engine reads with the cell's ledger.
 
     These are the settings, corrections, versions and newest labels. Of the ledger itself only the
-    newest entry is checked. A cell without any entry must have none of these.
+    newest entry is checked. Rows that name a later entry are not read, because another connection
+    may write meanwhile. A cell without any entry must have no settings (but those that the store
+    itself keeps), and no row that names no entry.
 
     Parameters
     ----------
@@ -404,10 +408,10 @@ def _find_table_error(
 
     Return the first difference in words, or "". A difference is a row whose values do not fit its
     stored sum, or rows that were removed, added or replaced. The stored states of versions are not
-    read. `name` is that of a table in IN_FORCE. `chained` is the chain of the table,
-    the digest over all its rows so far, that ledger entry `last_entry` has. Rows of later entries
-    are not read, since another connection may write meanwhile. Reading begins at number `first`, or
-    at an earlier row that belongs to the same ledger entry.
+    read. `name` is that of a table in IN_FORCE. `chained` is the chain of the table, the digest
+    over all its rows so far, that ledger entry `last_entry` has. Rows of later entries are not
+    read, since another connection may write meanwhile. Reading begins at number `first`, or at an
+    earlier row that belongs to the same ledger entry.
     """
     number = IN_FORCE[name]
     table = number.table

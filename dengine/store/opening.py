@@ -59,8 +59,9 @@ def open_store(
     StoreError
         For an argument of another type, a database that cannot be used or is another program's, a
         ledger with another key than the one in the file that DENGINE_LEDGER_KEY names, if that file
-        cannot be read, a cell of another product, a product for a cell that has worked without one,
-        and a time limit that is not above 0 or not finite.
+        cannot be read or holds fewer than 16 bytes, a cell of another product, a product whose name
+        is blank or not printable, or for a cell that has worked without one, and a time limit that
+        is not above 0 or not finite (that of the environment also for a store in memory).
     """
     from .peers import check_cell_exists  # SQLAlchemy is imported where it is used
     from .sql import SqlStore

@@ -168,8 +168,8 @@ class OwnedFile:
 
         The file becomes at least `size` bytes long, with zeros at its end. If the system cannot
         reserve the space, for example on a full disk, the file keeps its size and nothing is
-        raised. OSError is raised only if the sync fails, or the file cannot be cut back to its
-        size.
+        raised. OSError is raised only if the file is closed, the sync fails, or the file cannot be
+        cut back to its size.
         """
         before = self.size
         try:

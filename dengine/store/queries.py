@@ -62,8 +62,8 @@ class Scope:
 
         Labels are numbered in the order in which they came; training labels are those of traces
         that are not quarantined. 1 if there are fewer than `window`. For a product the labels are
-        not read, and the number is an estimate, 2 * `window` below the newest: it may be below 1,
-        and is too high if more than half of the newest labels are no training labels.
+        not read, and the number is an estimate, the newest number + 1 - 2 * `window`: it may be
+        below 1, and is too high if more than half of the newest labels are no training labels.
         """
         if self.product is not None:  # by their numbers, or all would be read to be sorted
             return self.newest(connection, LABEL.c.seq) + 1 - 2 * window
@@ -125,8 +125,9 @@ def newest_of(
 
     With `conditions`, only over the rows that fulfil them all. The result is NULL if there is none.
     `column` has a table's row numbers. In the table of versions each cell's newest retrain that
-    fulfils the conditions counts, so a column must increase with `retrain`. The query is fast: for
-    each cell the database reads the index from its end, one row if the conditions hold there.
+    fulfils the conditions counts, so `column` must increase with the table's column `retrain`. The
+    query is fast: for each cell the database reads the index from its end, one row if the
+    conditions hold there.
     """
     table = column.table
     peer = cells_of(product).subquery()

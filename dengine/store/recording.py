@@ -231,7 +231,7 @@ class Recorder:
         A journal of more than 8 MiB is cleared first, if the `Drainer` copies its last records to
         the database within BATCH_SECONDS (0.05 s). If the journal's file was deleted, moved or
         replaced, it is created again, which is logged, and an event says so. Raise StoreError if
-        the disk fails; the entries then stay in `unwritten`.
+        the disk fails, or that file cannot be created; the entries then stay in `unwritten`.
         """
         if self._journal.end > LONG:  # a cell that never pauses would fill the disk
             with self.changed:
@@ -262,9 +262,10 @@ class Recorder:
         """Create a new file for a journal whose file was lost; log this, and record an event.
 
         Records that the database lacks are copied into it from the lost file, which is still open.
-        `error` is the text of log and event. Raise StoreError, after the log line but without an
-        event, if the file cannot be written, another engine has locked it, or the lost file cannot
-        be read; the journal then still uses the lost file.
+        A file that is at its path by now is written over. `error` is the text of log and event.
+        Raise StoreError, after the log line but without an event, if the file cannot be written,
+        another engine has locked it, or the lost file cannot be read; the journal then still uses
+        the lost file.
         """
         log.error("%s It is created again with what the store lacks.", error)
         with self.changed:  # nobody reads it or writes its header meanwhile

@@ -597,7 +597,8 @@ def _to_column(value: Any, type_: type) -> Any:
     """Return the value of a field for its column: a text, number, JSON text or packed float32.
 
     None stays None. `type_` is the type of the field. A value of another type is converted to it;
-    ValueError, TypeError or OverflowError is raised if it cannot be.
+    ValueError, TypeError or OverflowError is raised if it cannot be. Only an array is not made of
+    another type: AttributeError is raised.
     """
     if value is None:
         return None

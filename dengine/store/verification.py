@@ -221,9 +221,9 @@ def _inspect_journal(path: Path) -> tuple[list[EntryName], int | None, str]:
 
     Return the ledger entries that it names (number and digest), the number of records that its
     store has not taken, and in words which records are damaged or missing, "" if none is. If there
-    is no journal, or it cannot be read, the head, a small file beside it, gives the ledger entry,
-    the number is None and the text "". If the disk fails while the records are read, OSError is
-    raised.
+    is no journal, or it cannot be read, the head, a small file beside it, gives the ledger entry
+    (none if it has none), the number is None and the text "". If the disk fails while the records
+    are read, OSError is raised.
     """
     with suppress(StoreError):  # it is missing, damaged, or another user's
         records, journal = read_undrained(path)
@@ -350,8 +350,9 @@ class CellCheck:
         """Yield a fault for each row of a table that was changed or is not in the ledger.
 
         A row with neither a ledger entry nor a sum is not in the ledger: something beside dengine
-        wrote it. A row was changed if its values do not fit its stored sum. The state of a version
-        has a sum of its own, and a fault of its own.
+        wrote it. But a row with a sum that fits and no entry, or one below 1, is not noticed. A row
+        was changed if its values do not fit its stored sum. The state of a version has a sum of its
+        own, and a fault of its own.
 
         The sums of every row with an entry, also of a changed one, are kept for `_check_ledger`.
         Each row adds 1 to `rows`. After every 500th row (CHUNK) `on_rows` is called with 500; `run`
@@ -384,8 +385,9 @@ class CellCheck:
         `digests` gets the digest of each entry, hexadecimal, oldest first. An entry must fit the
         digest of the entry before, and the sums of its rows as they are stored: that a row does not
         fit its sum is a fault of its own. All rows must be checked first (`_check_rows`). After an
-        entry that was changed, only this entry is a fault. Only the first 20 missing entries are
-        yielded; those behind the newest that an entry or a row names cannot be noticed.
+        entry that was changed, only this entry is a fault; the entry behind a missing one is a
+        fault, too. Only the first 20 missing entries are yielded; those behind the newest that an
+        entry or a row names cannot be noticed.
         """
         sums = {}
         for table, packed in self._sums.items():
