@@ -66,5 +66,6 @@ def test_a_proposal_leaves_open_what_nothing_proves_and_shows_the_candidates(nam
 
 @pytest.mark.parametrize("name", REFUSED)
 def test_what_holds_no_samples_is_refused_with_the_reason(name):
+    source = CORPUS / name / EXPECTED[name]["source"]
     with pytest.raises(DataError, match=EXPECTED[name]["refused"]):
-        describe(CORPUS / name / EXPECTED[name]["source"])
+        load_dataset(source, describe(source))

@@ -79,11 +79,11 @@ def describe(source: Any, stated: Stated | None = None) -> Description:
     Raises
     ------
     DataError
-        If there is no file, or none that can be read and holds samples (a table of results does
-        not), or if the package that reads such files is not installed. Also if a stated value is
-        wrong: an unknown key or a value of the wrong type, a column of times or a channel that does
-        not exist, a source of labels that has no words, a malformed pattern of files, or settings
-        in `[text]` or `[time]` that no file can be read with.
+        If there is no file, or none that can be read and holds samples, or if the package that
+        reads such files is not installed. Also if a stated value is wrong: an unknown key or a
+        value of the wrong type, a column of times or a channel that does not exist, a source of
+        labels that has no words, a malformed pattern of files, or settings in `[text]` or `[time]`
+        that no file can be read with.
     SettingError
         If a stated `windows.trigger`, which cuts long recordings, is malformed.
     ValueError
@@ -256,9 +256,9 @@ def propose_tables(p: Proposal, files: Tables) -> None:
     without damage, with only the rows that are samples, `p.columns` their columns, and `p.names` is
     emptied unless each file is one part. If the layout or `part.column` is `?`, nothing more is
     proposed: `p.tables` and `p.names` stay, and a note on `channels` says why. Raises DataError if
-    there is no part without damage, or only a table of results, if the tables do not split as a
-    stated layout says, or if a stated column, setting in `[time]` or source of labels is wrong, and
-    SettingError for a malformed `windows.trigger`.
+    there is no part without damage, if the tables do not split as a stated layout says, or if a
+    stated column, setting in `[time]` or source of labels is wrong, and SettingError for a
+    malformed `windows.trigger`.
     """
     p.is_cut |= any(len(table.lines) > MOST_ROWS for table in files)
     files = [table.take(slice(MOST_ROWS)) for table in files]

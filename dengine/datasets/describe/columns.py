@@ -6,6 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property
+from itertools import groupby
 from pathlib import Path
 from statistics import mode
 from typing import Any
@@ -94,10 +95,14 @@ class Column:
         )
 
     @cached_property
+    def runs(self) -> list[list[str]]:
+        """The word of each run of successive rows with one word, in each recording."""
+        return [[word for word, _ in groupby(words)] for words in self.words]
+
+    @cached_property
     def fixed(self) -> list[str]:
         """The word of each recording; empty if one has several words or no rows."""
-        is_fixed = all(len(words) and (words == words[0]).all() for words in self.words)
-        return [str(words[0]) for words in self.words] if is_fixed else []
+        return [words[0] for words in self.runs] if {*map(len, self.runs)} == {1} else []
 
     @cached_property
     def numbers(self) -> list[Floats]:
