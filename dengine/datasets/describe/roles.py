@@ -12,6 +12,7 @@ import numpy as np
 from ...errors import DataError, listed
 from ..description import ANY, UNKNOWN, LabelSource, PartSource, RowWords, expect_one_of
 from ..read.files import natural_key
+from ..read.places import without_label, without_suffix
 from ..read.recordings import is_dropped, kept_rows
 from ..read.split import match_numbered
 from ..units import quantity_of
@@ -20,7 +21,6 @@ from .clock import is_clock, propose_clock, propose_rate
 from .columns import MOST_WORDS, Column, Proposal, columns_of, counts_of
 from .labels import NAME, has_meaning, lines_of, part_words, propose_label
 from .layout import PART_NAME
-from .order import propose_order
 
 SPARSE = 0.1
 STRANGE = 0.01
@@ -34,6 +34,18 @@ FORCES = (
     re.compile(r"(?i)(^|[^a-z])f_?z(?![a-z])|(force|kraft|wrench)[^a-z]*z|force_2$"),
     re.compile(r"(?i)force|kraft|fuerza|forza|load|torque|drehmoment|thrust|effort|last\b|力|荷重"),
     re.compile(r"(?i)^(.*\.)?_?(f\b.*|value)$"),
+)
+
+# Dates in names. Those in the group `odd` are not sorted by name: they have the day or the month
+# first, the month as a word, or AM and PM.
+DATE = re.compile(
+    r"(?i)(?P<odd>(?<![a-z])(jan|feb|m[aä]r|apr|ma[iy]|jun|jul|aug|sep|o[ck]t|nov|de[cz])(?![a-z])"
+    r"|\d ?[ap]m(?![a-z])|(?<!\d)\d\d?([-_])\d\d?\3(19|20)\d\d(?!\d)"
+    r"|(?<!\d)[0-3]\d[01]\d20[0-3]\d(?!\d))|(?<!\d)(19|20)\d\d([-_.]?)[01]\d\6[0-3]\d"
+)
+ODD = (
+    "name, if that is the order; the names have dates that are sorted otherwise: rename the files, "
+    "with year, month and day in front"
 )
 
 
@@ -74,19 +86,17 @@ def propose_roles(p: Proposal) -> None:
 def set_rows(p: Proposal, rows: Mapping[str, RowWords]) -> None:
     """Set `[rows]` in `p`, and leave the rows that are no samples out of its tables and columns.
 
-    A column of `rows` with `?` in its `keep` is left aside. A recording keeps all rows if it lacks
-    one of the others, or has a word without a meaning there. Nothing changes if `rows` is empty.
+    A recording keeps all rows if it lacks a column of `rows`, or has a word without a meaning
+    there, so if `keep` is `?`. Nothing changes if `rows` is empty.
     """
-    if not rows:
-        return
-    p.description = replace(p.description, rows=rows)
-    certain = {name: about for name, about in rows.items() if UNKNOWN not in about.keep}
-    tables = [table for table in p.tables if not is_dropped(table, certain)]
-    for i, table in enumerate(tables):
-        with suppress(DataError):
-            tables[i] = kept_rows(table, certain)[0]
-    p.tables = tables
-    p.columns = columns_of(tables, p.description.text)
+    if rows:
+        p.description = replace(p.description, rows=rows)
+        tables = [table for table in p.tables if not is_dropped(table, rows)]
+        for i, table in enumerate(tables):
+            with suppress(DataError):
+                tables[i] = kept_rows(table, rows)[0]
+        p.tables = tables
+        p.columns = columns_of(tables, p.description.text)
 
 
 def qualify_rows(p: Proposal) -> None:
@@ -96,17 +106,19 @@ def qualify_rows(p: Proposal) -> None:
     several, its `keep` is `?`, with a note that counts them; if it has one, that becomes its
     `keep`. If the user stated some words of a column, its other words are added to `keep`, or to
     `drop` if `keep` is stated: as `*` if they are more than 12, and not if `*` is stated. Rows that
-    are then known to be no samples are left out of `p.tables` and `p.columns`. Raises SettingError
-    for a malformed `windows.trigger`.
+    are no samples are left out of `p.tables` and `p.columns`; but none are while a `keep` is `?`,
+    nor those of a recording that lacks a column of `[rows]`. Raises SettingError for a malformed
+    `windows.trigger`.
     """
     rows = dict(p.description.rows)
     for name in rows.keys() & p.columns.keys():
         about = rows[name]
         named = {*about.keep, *about.drop, *about.invalid}
-        rest = () if ANY in named else tuple(sorted(p.columns[name].counts.keys() - named))
-        key = "drop" if about.keep else "keep"
+        rest = tuple(sorted(p.columns[name].counts.keys() - named))
         words = rest if len(rest) <= MOST_WORDS else (ANY,)
-        rows[name] = replace(about, **{key: getattr(about, key) + words})
+        if ANY not in named:
+            key = "drop" if about.keep else "keep"
+            rows[name] = replace(about, **{key: getattr(about, key) + words})
     n_rows = max(column.counts.total() for column in p.columns.values())
     for column in p.unused:
         if not qualifies(column, n_rows):
@@ -202,7 +214,7 @@ def _doubt_on(p: Proposal, name: str) -> str:
         return f"{name} may be a set value"
     columns = match_numbered(name, p.tables[0].origin.get(name, ()) if p.tables else ())
     steps = np.diff([float(match[1]) for match in columns])
-    odd = np.flatnonzero(np.abs(steps - steps[:1]) > np.abs(steps[:1]) / 2)
+    odd = np.flatnonzero(np.abs(steps - steps[:1]) > steps[:1] / 2)
     return f"{name} is not numbered evenly at {columns[odd[0] + 1][0]}" if len(odd) else ""
 
 
@@ -261,23 +273,24 @@ def propose_lengths(p: Proposal) -> None:
     stays. Another note counts the recordings that end with several zeros, if they are more than
     10 % and the numbers of zeros differ: these may fill up shorter ones.
     """
-    first = [p.columns[name] for name in p.description.channels][:1]
-    lengths = [len(words) for column in first for words in column.words if len(words)]
-    usual = int(np.median(lengths or 0))
-    others = [n for n in lengths if n != usual]
-    if others:
-        text = (
-            f"{len(others)} of {len(lengths)} recordings have another length, {min(others)} to "
-            f"{max(others)}; other choices: cut, pad-all, resample, strict"
-        )
-        p.put("traces.lengths", "pad" if len(others) > SPARSE * len(lengths) else "strict", text)
-    zeros = [len(x) - len(np.trim_zeros(x, "b")) for column in first for x in column.numbers]
-    filled = [n for n in zeros if n > 1]
-    is_filled = len({*filled}) > 1 and len(filled) > SPARSE * len(zeros)
-    text = (
-        f"{len(filled)} recordings end with 2 to {max(filled, default=0)} zeros: are these samples?"
-    )
-    p.put("traces.samples", usual, text if is_filled else "")
+    for channel in [*p.description.channels][:1]:
+        column = p.columns[channel]
+        lengths = [len(words) for words in column.words if len(words)]
+        usual = int(np.median(lengths or 0))
+        others = [n for n in lengths if n != usual]
+        if others:
+            text = (
+                f"{len(others)} of {len(lengths)} recordings have another length, {min(others)} to "
+                f"{max(others)}; other choices: cut, pad-all, resample, strict"
+            )
+            is_few = len(others) <= SPARSE * len(lengths)
+            p.put("traces.lengths", "strict" if is_few else "pad", text)
+        zeros = [len(x) - len(np.trim_zeros(x, "b")) for x in column.numbers]
+        filled = [n for n in zeros if n > 1]
+        note = ""
+        if len({*filled}) > 1 and len(filled) > SPARSE * len(zeros):
+            note = f"{len(filled)} recordings end with 2 to {max(filled)} zeros: are these samples?"
+        p.put("traces.samples", usual, note)
 
 
 def list_others(p: Proposal) -> None:
@@ -294,3 +307,27 @@ def list_others(p: Proposal) -> None:
         p.put("exclude", others)
     units = {column.name: column.unit for column in p.unused}
     p.put("ignored", units)
+
+
+def propose_order(p: Proposal) -> None:
+    """Set `order` in `p` to `?`, with a note, if the file names, sorted, need not be the order.
+
+    That is so if a file name stands in several folders, once the text of `label.path` is left out;
+    if a file name has a date that is written with the day, the month or AM and PM so that names do
+    not sort by it, or the names are not in the order of their dates; or if a column of `p.unused`
+    has one date or time per recording, and these, as `natural_key` sorts texts, are in another
+    order. If several hold, the note is on the last. An `order` that the user stated stays. Raises
+    SettingError for a malformed `windows.trigger`.
+    """
+    paths = [without_label(p.description.label, without_suffix(name)) for name in p.names]
+    names = [path.rpartition("/")[2] for path in paths]
+    if len({*paths}) > len({*names}):
+        p.put("order", UNKNOWN, "name: by file name, or path: folder by folder")
+    matches = [*filter(None, map(DATE.search, names))]
+    dates = [match.string[match.start() :] for match in matches]
+    if any(match["odd"] for match in matches) or dates != sorted(dates, key=natural_key):
+        p.put("order", UNKNOWN, ODD)
+    for column in p.unused:
+        ranks = [*map(natural_key, column.fixed)] if column.forms else []
+        if ranks != sorted(ranks):
+            p.put("order", UNKNOWN, f"name, or {column.name}, whose dates have another order")
