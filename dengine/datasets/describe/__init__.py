@@ -30,7 +30,7 @@ from .columns import Proposal, Stated, Tables
 from .labels import WORD
 from .layout import layout_of, parts_of
 from .roles import propose_roles
-from .text_form import MOST_BYTES, decode, propose_form
+from .text_form import MOST_BYTES, propose_form
 
 TEXTS = (".csv", ".tsv", ".txt", ".dat", ".asc", ".lvm", ".log", ".prn")
 # The format of files with each suffix; `.gz` may stand behind it.
@@ -51,8 +51,7 @@ NO_RECORDING = re.compile(
 BAG = ".mcap"
 MOST_FILES = 60  # that are read
 MOST_ROWS = 50_000
-MOST_PIECES = 4  # of a part's curve, in files with numbers behind their names
-LEAST_PARTS = 10  # that have such pieces
+MOST_SIGNALS = 4  # of a part, or pieces of its curve, that have a file each
 Names = Sequence[str]
 
 
@@ -138,25 +137,21 @@ def likely_endings(names: Names) -> Names:
     """Return the endings of file names of which one may tell the recordings from other files.
 
     They are the suffixes that several files have, and `.mcap` if one file has it; or else all. If
-    there is only one, the endings that tell signals apart come before it: `Kraft.csv` of
-    `1_Kraft.csv`, the last word with its suffix, behind the part. There must be two parts and two
-    such endings or more, and each part must have a file with each ending. An ending that is a word
-    like `ok` or `pending` tells no signal. Endings with digits count only if there are 2 to 4 of
-    them and 10 parts or more: numbered pieces of a part's curve.
+    there is only one, the endings that tell signals or pieces of a curve apart come before it:
+    `Kraft.csv` of `1_Kraft.csv`, the last word with its suffix, behind the part. There must be 2 to
+    4 such endings, as many parts or more, and a file for each part with each ending. An ending that
+    is a word like `ok` or `pending` tells no signal.
     """
     counts = Counter(map(suffix_of, names))
     likely = [suffix for suffix, n in counts.items() if n > 1 or suffix == BAG] or [*counts]
     words = [re.split(r"[-_ ](?=[^-_ /]+$)", name) for name in names]
     n_parts = len({name[0] for name in words})
     endings = sorted({name[-1] for name in words})
-    is_grid = n_parts * len(endings) == len(names) and min(n_parts, len(endings)) > 1
-    may_be_pieces = len(endings) <= MOST_PIECES and n_parts >= LEAST_PARTS
-    text = " ".join(endings)
-    is_other = re.search(rf"(?i)\b({WORD})\.", text) or (
-        re.search(r"\d", text) and not may_be_pieces
+    is_grid = n_parts * len(endings) == len(names) and 1 < len(endings) <= min(
+        n_parts, MOST_SIGNALS
     )
-    is_signal = len(likely) == 1 and is_grid and not is_other
-    return [*endings, *likely] if is_signal else likely
+    is_verdict = re.search(rf"(?i)\b({WORD})\.", " ".join(endings))
+    return [*endings, *likely] if len(likely) == 1 and is_grid and not is_verdict else likely
 
 
 def suffix_of(name: str) -> str:
@@ -234,8 +229,7 @@ def table_in(p: Proposal, content: bytes, name: str) -> Table:
     """
     about = p.description
     if about.format in ("text", "jsonl") and len(content) > MOST_BYTES:
-        encoding = about.text.encoding
-        content = decode(content, encoding)[1].rpartition("\n")[0].encode(encoding) or content
+        content = content[:MOST_BYTES].rpartition(b"\n")[0] or content
         p.is_cut = True
     if about.format == "text":
         table = read_text(content, name, about.text)
