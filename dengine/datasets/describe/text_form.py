@@ -71,11 +71,7 @@ def look(content: bytes, stated: Stated) -> Look:
     if not text.strip():
         raise DataError("Expected a text, got an empty file.")
     marks = stated.get("text.delimiter", DELIMITERS)
-    head = lines[:MOST_LINES]
-    share, width, delimiter = max((*_share_of_numbers(head, mark), mark) for mark in marks)
-    if share == 0:  # a single column
-        delimiter = ","
-        width = 1
+    _, width, delimiter = max(_share_of_numbers(lines[:MOST_LINES], mark) for mark in marks)
     rows = [[*map(str.strip, split_line(line, delimiter))] for line in lines]
     data = _first_row(rows[:MOST_LINES], width)
     is_closed = not any(row[-1] for row in rows[data:] if len(row) == width)  # by a delimiter
@@ -102,23 +98,24 @@ def decode(content: bytes, stated: str) -> tuple[str, str]:
     return encoding, text.decode()[:MOST_BYTES]
 
 
-def _share_of_numbers(lines: Sequence[str], delimiter: str) -> tuple[float, int]:
-    """Return a score of how well a delimiter splits lines into numbers, and the cells per line.
+def _share_of_numbers(lines: Sequence[str], delimiter: str) -> tuple[float, int, str]:
+    """Return a score of how well a delimiter splits lines into numbers, the cells per line, and it.
 
     The score is the share of lines with the most frequent number of cells, times the share of
     numbers among their cells that are not empty, plus 0.01; it is divided by 1.15 if the delimiter
     is a blank, since cells may have blanks in them, and rounded to two decimals, so that near
-    scores are equal. It is 0 only if the lines have fewer than 2 cells, or all cells are empty. The
-    first third of the lines, which may be text above the samples, and empty lines are left out.
+    scores are equal. If the lines have fewer than 2 cells, or all cells are empty, the result is a
+    score of 0 for a single column, with a comma as its delimiter. The first third of the lines,
+    which may be text above the samples, and empty lines are left out.
     """
     rows = [split_line(line, delimiter) for line in lines[len(lines) // 3 :] if line.strip()]
     width = mode([*map(len, rows), 0])
     same = [row for row in rows if len(row) == width]
     cells = [cell for row in same for cell in row if cell.strip()]
     if width < 2 or not cells:
-        return 0.0, width
+        return 0.0, 1, ","
     share = _count_numbers(cells) / len(cells) * len(same) / len(rows) + 0.01
-    return round(share / (BLANKS_LEAD if delimiter == BLANK else 1), 2), width
+    return round(share / (BLANKS_LEAD if delimiter == BLANK else 1), 2), width, delimiter
 
 
 def _count_numbers(cells: Sequence[str]) -> int:
@@ -200,7 +197,7 @@ def propose_form(p: Proposal, contents: Mapping[str, bytes], faults: list[Fault]
     forms = {name: (item.form.delimiter, item.width, item.line) for name, item in looks.items()}
     usual = mode([*forms.values(), ()])
     same = [name for name, form in forms.items() if form == usual]
-    odd = [name for name, form in forms.items() if form != usual]
+    odd = [name for name in forms if name not in same]
     p.others = [*p.others, *odd]
     p.names = [name for name in p.names if name not in odd]
     if sum(len(looks[name].rows) >= LEAST_RUN for name in odd) > 1:
@@ -220,15 +217,14 @@ def _propose_keys(p: Proposal, looks: Sequence[Look]) -> None:
 
     looks : how each of the files, which are of one form, is written, and the cells of its samples.
     """
-    usual = looks[0]
+    usual = next((item for item in looks if item.form.encoding == LATIN), looks[0])
     form = usual.form
     above = int(form.header)
     is_moved = {item.form.header for item in looks} != {above}
     if above and (is_moved or isinstance(p.description.text.header, str)):
         units = form.units and form.units - above
         form = replace(form, header=usual.line, units=units, data=form.data - above)
-    if any(item.form.encoding == LATIN for item in looks):
-        form = replace(form, encoding=LATIN)
+    if form.encoding == LATIN:
         p.notes["text.encoding"] = f"{LATIN} reads any text: look at the letters below"
     names = () if p.stated.get("text.header") else tuple(_column_names(usual))
     for key, value in asdict(replace(form, names=names)).items():
@@ -240,21 +236,22 @@ def _propose_keys(p: Proposal, looks: Sequence[Look]) -> None:
 def _column_names(usual: Look) -> Sequence[str]:
     """Return the names for `text.names`; empty if the header names each column.
 
-    If the header has only empty cells beyond the last column, the names are those of the header; if
-    it has fewer cells than there are columns, the last ones are named `column3`, `column4`, ...
-    Without a header, or if it has more words than there are columns, the names are `c0`, `c1`, ...;
-    for 20 columns or more it is `x*`, which names all of them. Such a table may have a part in each
-    row: if its first column has 2 to 12 different words, all whole numbers, and fewer of them than
-    the second, it is named `class`, before `x*`.
+    If the header has only empty cells beyond the last column, the names are those of the header; so
+    they are if it lacks the last column and this is empty, and then that is named like `column3`.
+    Without a header, or if it has another number of words, the names are `c0`, `c1`, ...; for 20
+    columns or more it is `x*`, which names all of them. Such a table may have a part in each row:
+    if its first column has 2 to 12 different words, all whole numbers, and fewer of them than the
+    second, it is named `class`, before `x*`.
 
     usual : how a typical file is written, and the cells of its samples.
     """
     width = usual.width
-    line = COMMENT.sub("", usual.line.lstrip())
-    cells = split_line(line, usual.form.delimiter)
-    if line and not any(map(str.strip, cells[width:])):
-        names = header_names([*cells, *[""] * (width - len(cells))])[:width]
-        return names if len(cells) != width else []
+    cells = split_line(COMMENT.sub("", usual.line.lstrip()), usual.form.delimiter)
+    if len(cells) == width:
+        return []
+    is_closed = not any(row[-1] for row in usual.rows if len(row) == width)  # by a delimiter
+    if len(cells) >= width - is_closed and not any(map(str.strip, cells[width:])):
+        return header_names([*cells, ""])[:width]
     if width < MOST_NAMES:
         return [f"c{i}" for i in range(width)]
     firsts, seconds = ({row[i] for row in usual.rows if len(row) > i} for i in (0, 1))
