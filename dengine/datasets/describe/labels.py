@@ -263,12 +263,19 @@ def propose_label(p: Proposal) -> None:
     stated = [label] if any(getattr(label, kind) for kind in SOURCES) else []
     counted = count_sources(p, stated)
     named = [source for source in counted if stated or is_named_like_verdict(source)]
-    known = [s for s in named if s.meanings.keys() >= {*counted[s].values()}]
+    meanings = {
+        source: {name: source.meanings.get(word, UNKNOWN) for name, word in words.items()}
+        for source, words in counted.items()
+    }
+    known = [source for source in named if UNKNOWN not in meanings[source].values()]
     certain = [source for source in known if UNKNOWN not in source.good + source.bad]
     doubt = NO_LABEL
     if certain:
-        first = counted[certain[0]]
-        n_odd = max(count_contradictions(certain[0], other, counted) for other in counted)
+        first = meanings[certain[0]]
+        n_odd = max(  # recordings that are good by one source and bad by the other
+            sum({meaning, others.get(name)} == {0, 1} for name, meaning in first.items())
+            for others in meanings.values()
+        )
         is_clear = n_odd == 0
         doubt = f"two of these disagree on {n_odd:,} of {len(first):,} recordings"
     else:
@@ -287,17 +294,3 @@ def propose_label(p: Proposal) -> None:
     p.notes[f"label.{place}"] = note
     unclear = [key for key in ("good", "bad") if UNKNOWN in getattr(label, key)]
     p.notes |= {f"label.{key}": f"which words? {note}" for key in unclear}
-
-
-def count_contradictions(
-    label: LabelSource, other: LabelSource, counted: Mapping[LabelSource, Words]
-) -> int:
-    """Return how many recordings are good by one of two sources of labels and bad by the other.
-
-    `counted` has the words of each source, by recording.
-    """
-    words = counted[other]
-    return sum(
-        {label.meanings.get(word), other.meanings.get(words.get(name, ""))} == {0, 1}
-        for name, word in counted[label].items()
-    )

@@ -27,8 +27,8 @@ def layout_of(p: Proposal, files: Tables) -> str:
     """Return how the files hold parts, as `Description.layout` names it; `?` if it is not certain.
 
     `files` has the table of each file that is looked at. These rules come one after another.
-    Several JSON or .ts files, of which the first has one row, are `files`. Lists in the first row
-    of the first table, or 20 or more columns like `x0`, `x1`, make it `wide`, or `npz` for an .npz
+    Several JSON or .ts files, of which the first has one row, are `files`. Lists of two items or more in the first
+    row of the first table, or 20 or more columns like `x0`, `x1`, make it `wide`, or `npz` for an .npz
     file. It is `long` if a column of the first table may tell the parts apart (`may_tell_parts`),
     or if a file has several words of a stated `part.column`; unless it is stated, `part.column` is
     then set in `p` to the only such column with a name like that of a part's number and no word in
@@ -40,7 +40,9 @@ def layout_of(p: Proposal, files: Tables) -> str:
     first = files[0]
     if kind in OBJECTS and len(p.names) > 1 and len(first.lines) == 1:
         return "files"
-    if numbered_columns(first) or has_lists(first):
+    cells = [cell for column in first.columns.values() for cell in column[:1]]
+    has_lists = any(isinstance(cell, list | np.ndarray) and len(cell) > 1 for cell in cells)
+    if has_lists or numbered_columns(first):
         return "npz" if kind == "npz" else "wide"
     columns = columns_of(files, TextForm())
     runs = [column for column in columns.values() if may_tell_parts(column)]
@@ -98,12 +100,6 @@ def numbered_columns(table: Table) -> list[str]:
     """
     counts = Counter(NUMBER.sub(ANY, name) for name in table.columns)
     return [pattern for pattern, n in counts.items() if n >= LEAST_NUMBERED]
-
-
-def has_lists(table: Table) -> bool:
-    """Return whether the first cell of any column is a list or array of two items or more."""
-    firsts = [cell for column in table.columns.values() for cell in column[:1]]
-    return any(isinstance(cell, list | np.ndarray) and len(cell) > 1 for cell in firsts)
 
 
 def parts_of(p: Proposal, files: Tables) -> list[Table]:

@@ -56,8 +56,9 @@ def propose_roles(p: Proposal) -> None:
     clock, part, label, channels, and what follows from these: words for lost samples, rate, length
     of the traces, order, ignored columns and files. A key is `?` if no rule proves a value. If it
     is open which rows are samples, `traces.samples` is `?` and no rate is set; a clock with `?`
-    gives no rate either. Stated keys stay, but a stated `ignored` is replaced (`list_others`), and
-    a stated `[rows]` gets further columns and words (`qualify_rows`, `find_lost`). `p.columns` is
+    gives no rate either. `ignored` becomes the columns without any use, with their units, and
+    `exclude` the files in `p.others` without listings of labels, unless it is `?`. Stated keys
+    stay, but a stated `ignored` is replaced, and a stated `[rows]` gets further columns and words (`qualify_rows`, `find_lost`). `p.columns` is
     set, and `p.tables` loses rows that are no samples. Raises DataError if a stated column of times
     or channel does not exist, a setting in `[time]` is wrong, or a stated source of labels has no
     words or cannot be read, and SettingError for a malformed `windows.trigger`.
@@ -80,7 +81,11 @@ def propose_roles(p: Proposal) -> None:
         propose_lengths(p)
     if p.description.order == "name" and UNKNOWN not in clock.column:
         propose_order(p)
-    list_others(p)
+    listings = {source.listing for source in p.description.labels}
+    others = sorted({*p.others} - listings, key=natural_key)
+    if UNKNOWN not in p.description.exclude and others:
+        p.put("exclude", others)
+    p.put("ignored", {column.name: column.unit for column in p.unused})
 
 
 def set_rows(p: Proposal, rows: Mapping[str, RowWords]) -> None:
@@ -291,22 +296,6 @@ def propose_lengths(p: Proposal) -> None:
         if len({*filled}) > 1 and len(filled) > SPARSE * len(zeros):
             note = f"{len(filled)} recordings end with 2 to {max(filled)} zeros: are these samples?"
         p.put("traces.samples", usual, note)
-
-
-def list_others(p: Proposal) -> None:
-    """Set in `p` the columns without any use as `ignored`, and the files `p.others` as `exclude`.
-
-    `ignored` has the unit of each column (`Column.unit`), and replaces also a stated `ignored`.
-    Listings of labels are not excluded. If there is no file, if `exclude` is stated, or if it is
-    `?` because other files may be recordings, it stays. Raises SettingError for a malformed
-    `windows.trigger`.
-    """
-    listings = {source.listing for source in p.description.labels}
-    others = sorted({*p.others} - listings, key=natural_key)
-    if UNKNOWN not in p.description.exclude and others:
-        p.put("exclude", others)
-    units = {column.name: column.unit for column in p.unused}
-    p.put("ignored", units)
 
 
 def propose_order(p: Proposal) -> None:

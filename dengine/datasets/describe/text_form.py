@@ -43,11 +43,13 @@ Rows = Sequence[Sequence[str]]
 class Look(NamedTuple):
     """The first lines of a file.
 
-    form : of the file. width : cells of a row. line : the header. rows : the cells of the samples.
+    form : of the file. width : cells of a row. is_closed : whether a delimiter ends each row.
+    line : the header. rows : the cells of the samples.
     """
 
     form: TextForm
     width: int
+    is_closed: bool
     line: str
     rows: Rows
 
@@ -74,10 +76,10 @@ def look(content: bytes, stated: Stated) -> Look:
     _, width, delimiter = max(_share_of_numbers(lines[:MOST_LINES], mark) for mark in marks)
     rows = [[*map(str.strip, split_line(line, delimiter))] for line in lines]
     data = _first_row(rows[:MOST_LINES], width)
-    is_closed = not any(row[-1] for row in rows[data:] if len(row) == width)  # by a delimiter
+    is_closed = not any(row[-1] for row in rows[data:] if len(row) == width)
     header, units = _head_lines(rows[:data], width - is_closed, stated)
     form = TextForm(encoding, delimiter, header=header, units=units, data=data + 1)
-    return Look(form, width, "".join(lines[header - 1 : header]), rows[data:])
+    return Look(form, width, is_closed, "".join(lines[header - 1 : header]), rows[data:])
 
 
 def decode(content: bytes, stated: str) -> tuple[str, str]:
@@ -249,8 +251,7 @@ def _column_names(usual: Look) -> Sequence[str]:
     cells = split_line(COMMENT.sub("", usual.line.lstrip()), usual.form.delimiter)
     if len(cells) == width:
         return []
-    is_closed = not any(row[-1] for row in usual.rows if len(row) == width)  # by a delimiter
-    if len(cells) >= width - is_closed and not any(map(str.strip, cells[width:])):
+    if len(cells) >= width - usual.is_closed and not any(map(str.strip, cells[width:])):
         return header_names([*cells, ""])[:width]
     if width < MOST_NAMES:
         return [f"c{i}" for i in range(width)]
