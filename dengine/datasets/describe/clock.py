@@ -161,12 +161,13 @@ def propose_rate(p: Proposal, tables: Tables) -> None:
 
     `tables` has the samples of each recording. Steps below 0 are left out of the mean, unless the
     user stated `time.sort`, and the rate is rounded to five digits. It is `?`, with a note, if it
-    is not between 1 Hz and 1 MHz, like that of times that only fall; then `time.gap`, the longest step that is allowed, is not looked at. Otherwise `check_steps` checks
-    the times, by the rate and the gap that the description has by then. If it refuses more
-    recordings than 10 % plus one, `time.gap` is set to `?`, with a note on the first. If all
-    recordings start after 1999 (UTC), `order` is set to `time`, also if the rate is `?`. Recordings
-    whose times cannot be read are skipped. Stated keys stay. Raises DataError if a stated format is
-    no form or unit of times, or if a setting in `[time]` is wrong (see `check_clock`).
+    is not between 1 Hz and 1 MHz, like that of times that only fall; then `time.gap`, the longest
+    step that is allowed, is not looked at. Otherwise `check_steps` checks the times, by the rate
+    and the gap that the description has by then. If it refuses more recordings than 10 % plus one,
+    `time.gap` is set to `?`, with a note on the first. If all recordings start after 1999 (UTC),
+    `order` is set to `time`, also if the rate is `?`. Recordings whose times cannot be read are
+    skipped. Stated keys stay. Raises DataError if a stated format is no form or unit of times, or
+    if a setting in `[time]` is wrong (see `check_clock`).
     """
     clock = p.description.time
     check_clock(clock)

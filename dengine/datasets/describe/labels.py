@@ -76,10 +76,9 @@ def with_meanings(source: LabelSource, words: Names) -> LabelSource:
     """
     words = sorted({*words})
     name = source.column or source.line or source.topic or ("([^" in source.path and source.path)
-    good, bad = GOOD, BAD
+    groups: Sequence[Sequence[str]] = (GOOD, BAD, UNCHECKED)
     if name and {word.lower() for word in words} <= {*YES, *NO, *UNCHECKED}:
-        good, bad = (YES, NO) if GOOD_NAME.fullmatch(name) else ((), ())
-    groups = (good, bad, UNCHECKED)
+        groups = (YES, NO, UNCHECKED) if GOOD_NAME.fullmatch(name) else ((), (), UNCHECKED)
     goods, bads, others = (tuple(w for w in words if w.lower() in group) for group in groups)
     return replace(
         source,

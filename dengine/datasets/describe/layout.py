@@ -27,14 +27,14 @@ def layout_of(p: Proposal, files: Tables) -> str:
     """Return how the files hold parts, as `Description.layout` names it; `?` if it is not certain.
 
     `files` has the table of each file that is looked at. These rules come one after another.
-    Several JSON or .ts files, of which the first has one row, are `files`. Lists of two items or more in the first
-    row of the first table, or 20 or more columns like `x0`, `x1`, make it `wide`, or `npz` for an .npz
-    file. It is `long` if a column of the first table may tell the parts apart (`may_tell_parts`),
-    or if a file has several words of a stated `part.column`; unless it is stated, `part.column` is
-    then set in `p` to the only such column with a name like that of a part's number and no word in
-    two files, or to `?` with a note. Several files, of which `p.names` may have more than were
-    looked at, are `files`. A single one gives `?`, with a note on what to state. Raises
-    UnreadableError if cells of columns that are looked at are lists.
+    Several JSON or .ts files, of which the first has one row, are `files`. Lists of two items or
+    more in the first row of the first table, or 20 or more columns like `x0`, `x1`, make it `wide`,
+    or `npz` for an .npz file. It is `long` if a column of the first table may tell the parts apart
+    (`may_tell_parts`), or if a file has several words of a stated `part.column`; unless it is
+    stated, `part.column` is then set in `p` to the only such column with a name like that of a
+    part's number and no word in two files, or to `?` with a note. Several files, of which `p.names`
+    may have more than were looked at, are `files`. A single one gives `?`, with a note on what to
+    state. Raises UnreadableError if cells of columns that are looked at are lists.
     """
     kind = p.description.format
     first = files[0]

@@ -24,6 +24,7 @@ from .layout import PART_NAME
 
 SPARSE = 0.1
 STRANGE = 0.01
+MOST_STEP = 1.5  # from one number of a column like `x0`, `x1` to the next, in usual steps
 PART_LINE = re.compile(r"(?i)serial|barcode|dmc|part ?(no|num|id)|teilenummer|werkst.ck|serien")
 QUALIFIER_NAME = re.compile(r"(?i)status|valid|quality|flag|error|state")
 SIGNAL = re.compile(r"(?i)(force|kraft|torque|drehmoment|load|last)([_ ]?[xyz])?")
@@ -58,10 +59,11 @@ def propose_roles(p: Proposal) -> None:
     is open which rows are samples, `traces.samples` is `?` and no rate is set; a clock with `?`
     gives no rate either. `ignored` becomes the columns without any use, with their units, and
     `exclude` the files in `p.others` without listings of labels, unless it is `?`. Stated keys
-    stay, but a stated `ignored` is replaced, and a stated `[rows]` gets further columns and words (`qualify_rows`, `find_lost`). `p.columns` is
-    set, and `p.tables` loses rows that are no samples. Raises DataError if a stated column of times
-    or channel does not exist, a setting in `[time]` is wrong, or a stated source of labels has no
-    words or cannot be read, and SettingError for a malformed `windows.trigger`.
+    stay, but a stated `ignored` is replaced, and a stated `[rows]` gets further columns and words
+    (`qualify_rows`, `find_lost`). `p.columns` is set, and `p.tables` loses rows that are no
+    samples. Raises DataError if a stated column of times or channel does not exist, a setting in
+    `[time]` is wrong, or a stated source of labels has no words or cannot be read, and SettingError
+    for a malformed `windows.trigger`.
     """
     p.columns = columns_of(p.tables, p.description.text)
     for name in (*p.description.time.column, *p.description.channels):
@@ -212,32 +214,29 @@ def _doubt_on(p: Proposal, name: str) -> str:
 
     The reasons: the column is named like a value that a controller aims at or like a limit
     (`F_soll`, `set_force`, `F_max`); `name` is like `x*` and stands for the columns `x0`, `x1`,
-    ..., and a step between two of their numbers differs from the first step by more than half of
-    it.
+    ..., and a step between two of their numbers is longer than 1.5 usual steps, the median.
     """
     if SET_VALUE.search(name):
         return f"{name} may be a set value"
     columns = match_numbered(name, p.tables[0].origin.get(name, ()) if p.tables else ())
     steps = np.diff([float(match[1]) for match in columns])
-    odd = np.flatnonzero(np.abs(steps - steps[:1]) > steps[:1] / 2)
-    return f"{name} is not numbered evenly at {columns[odd[0] + 1][0]}" if len(odd) else ""
+    if not len(steps) or steps.max() <= np.median(steps) * MOST_STEP:
+        return ""
+    return f"{name} is not numbered evenly at {columns[steps.argmax() + 1][0]}"
 
 
 def _units(p: Proposal) -> dict[str, str]:
     """Return the columns that may be channels, with their units; "" for no unit.
 
     Such a column has no other use in the description so far, and at least three different numbers.
-    At most 10 % of its cells are texts that do not mean a lost sample. Times, columns named like
-    counters of rows, and columns that are constant in each recording are left out. Raises
-    SettingError for a malformed `windows.trigger`.
+    Times, columns named like counters of rows, and columns that are constant in each recording are
+    left out. Raises SettingError for a malformed `windows.trigger`.
     """
     units = dict[str, str]()
     for column in p.unused:
-        name = column.name
-        is_text = column.strange.total() > SPARSE * column.counts.total()
-        is_other = is_clock(column) or COUNTER_NAME.fullmatch(name) or column.fixed
-        if not is_text and not is_other and len(column.counts) - len(column.odd) > 2:
-            units[name] = column.unit
+        is_other = is_clock(column) or COUNTER_NAME.fullmatch(column.name) or column.fixed
+        if not is_other and len(column.counts) - len(column.odd) > 2:
+            units[column.name] = column.unit
     return units
 
 
@@ -272,11 +271,11 @@ def find_lost(p: Proposal) -> None:
 def propose_lengths(p: Proposal) -> None:
     """Set `traces.samples` in `p` to the median length of the recordings, rounded down.
 
-    The length is that of the first channel. Recordings without rows are ignored, and without a
-    channel it is 0. If some have another length, and `traces.lengths` is not stated, a note counts
-    them; if they are more than 10 %, `traces.lengths` becomes `pad`. A stated `traces.samples`
-    stays. Another note counts the recordings that end with several zeros, if they are more than
-    10 % and the numbers of zeros differ: these may fill up shorter ones.
+    The length is that of the first channel; without one nothing is set. Recordings without rows are
+    ignored. If some have another length, and `traces.lengths` is not stated, a note counts them; if
+    they are more than 10 %, `traces.lengths` becomes `pad`. A stated `traces.samples` stays.
+    Another note counts the recordings that end with two zeros or more, if they are more than 10 %:
+    these may fill up shorter ones.
     """
     for channel in [*p.description.channels][:1]:
         column = p.columns[channel]
@@ -290,12 +289,10 @@ def propose_lengths(p: Proposal) -> None:
             )
             is_few = len(others) <= SPARSE * len(lengths)
             p.put("traces.lengths", "strict" if is_few else "pad", text)
-        zeros = [len(x) - len(np.trim_zeros(x, "b")) for x in column.numbers]
-        filled = [n for n in zeros if n > 1]
-        note = ""
-        if len({*filled}) > 1 and len(filled) > SPARSE * len(zeros):
-            note = f"{len(filled)} recordings end with 2 to {max(filled)} zeros: are these samples?"
-        p.put("traces.samples", usual, note)
+        n_filled = sum(not x[-2:].any() for x in column.numbers)
+        is_filled = n_filled > SPARSE * len(lengths)
+        note = f"{n_filled} recordings end with several zeros: are these samples?"
+        p.put("traces.samples", usual, note if is_filled else "")
 
 
 def propose_order(p: Proposal) -> None:

@@ -21,7 +21,7 @@ from ..read.files import caught, natural_key
 from ..read.text import BLANK, COMMENT, header_names, split_line, to_utf8
 from ..table import UnreadableError, pattern_of
 from ..units import is_unit
-from .columns import LEAST_RUN, NUMBER, Proposal, Stated
+from .columns import LEAST_RUN, MOST_WORDS, NUMBER, Proposal, Stated
 
 DELIMITERS = ";\t|, "
 BLANKS_LEAD = 1.15  # by which blanks must be the better delimiter, since cells may hold some
@@ -32,7 +32,6 @@ MOST_BYTES = 2_000_000  # of a file that are read
 LATIN = "cp1252"
 MOST_LINES = 200  # by which the delimiter and the first row of samples are found
 MOST_NAMES = 20  # columns without a header that get a name each
-MOST_CLASSES = 12  # whole numbers in the first column of a matrix that are its classes
 WHOLE = re.compile(r"-?\d+(\.0*)?(e\+00)?")
 UNIT_WORDS = re.compile(
     r"(?i)[\[(]?(hh:mm(:ss)?|dd\.mm\.yyyy|[\d.]+ ?[mu]?s|[mun]?s(ecs?)?|min|h)[\])]?"
@@ -116,13 +115,8 @@ def _share_of_numbers(lines: Sequence[str], delimiter: str) -> tuple[float, int,
     cells = [cell for row in same for cell in row if cell.strip()]
     if width < 2 or not cells:
         return 0.0, 1, ","
-    share = _count_numbers(cells) / len(cells) * len(same) / len(rows) + 0.01
+    share = len([*filter(NUMBER.fullmatch, cells)]) / len(cells) * len(same) / len(rows) + 0.01
     return round(share / (BLANKS_LEAD if delimiter == BLANK else 1), 2), width, delimiter
-
-
-def _count_numbers(cells: Sequence[str]) -> int:
-    """Return how many cells are numbers, with any decimal mark and any mark of thousands."""
-    return sum(1 for cell in cells if NUMBER.fullmatch(cell))
 
 
 def _first_row(rows: Rows, width: int) -> int:
@@ -136,7 +130,7 @@ def _first_row(rows: Rows, width: int) -> int:
     `0.1,5,` (a lost sample), but not `time,force,`. If the row found is a numbering
     (`is_numbering`) and the row below it is none, it names columns, and the row below is the first.
     """
-    counts = [_count_numbers(row) if len(row) == width else 0 for row in rows]
+    counts = [len([*filter(NUMBER.fullmatch, row)]) * (len(row) == width) for row in rows]
     least = max(0.6 * float(np.median(counts[len(counts) // 3 :])), 1)
     first = next((i for i in range(len(rows)) if min(counts[i : i + 4]) >= least), 0)
     forms = [NUMBER.sub("0", row[0]) if len(row) == width else "" for row in rows]
@@ -256,7 +250,7 @@ def _column_names(usual: Look) -> Sequence[str]:
     if width < MOST_NAMES:
         return [f"c{i}" for i in range(width)]
     firsts, seconds = ({row[i] for row in usual.rows if len(row) > i} for i in (0, 1))
-    is_class = 1 < len(firsts) <= min(MOST_CLASSES, len(seconds) - 1)
+    is_class = 1 < len(firsts) <= min(MOST_WORDS, len(seconds) - 1)
     return ["class", "x*"] if is_class and all(map(WHOLE.fullmatch, firsts)) else ["x*"]
 
 
