@@ -183,7 +183,7 @@ def propose_rate(p: Proposal, tables: Tables) -> None:
     if starts and min(starts) > YEARS[0]:
         p.put("order", "time")
     steps = [np.diff(seconds) for _, seconds in clocks]
-    means = [rising.mean() for rising in (s[s >= 0] for s in steps) if len(rising)]
+    means = [s[s >= 0].mean() for s in steps if (s >= 0).any()]
     usual = float(np.median(means or 0.0))
     if not is_rate(usual):
         text = (

@@ -75,29 +75,19 @@ class Column:
         return Counter(np.concatenate(self.words).tolist())
 
     @cached_property
-    def odd(self) -> Counter[str]:
+    def odd(self) -> dict[str, int]:
         """How often each word comes that is no number with any decimal mark; "" is such a word."""
-        return Counter({w: n for w, n in self.counts.items() if not NUMBER.fullmatch(w)})
-
-    @cached_property
-    def strange(self) -> Counter[str]:
-        """How often each word comes that is no number and does not mean a lost sample.
-
-        These are the words in `odd`, which are no numbers with any decimal mark, without those in
-        `LOST`, in any case of letters, and in `text.missing`.
-        """
-        return Counter(
-            {
-                word: n
-                for word, n in self.odd.items()
-                if word.lower() not in LOST and word not in self.form.missing
-            }
-        )
+        return {word: n for word, n in self.counts.items() if not NUMBER.fullmatch(word)}
 
     @cached_property
     def runs(self) -> list[list[str]]:
         """The word of each run of successive rows with one word, in each recording."""
         return [[word for word, _ in groupby(words)] for words in self.words]
+
+    @cached_property
+    def n_runs(self) -> int:
+        """The number of runs of successive rows with one word, in all recordings together."""
+        return sum(map(len, self.runs))
 
     @cached_property
     def fixed(self) -> list[str]:

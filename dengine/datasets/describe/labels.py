@@ -278,8 +278,8 @@ def propose_label(p: Proposal) -> None:
         is_clear = n_odd == 0
         doubt = f"two of these disagree on {n_odd:,} of {len(first):,} recordings"
     else:
-        rivals = [counted[source] for source in (counted if known else named)]
-        is_clear = bool(named) and all(words == counted[named[0]] for words in rivals)
+        rivals = {tuple(counted[source].items()) for source in (counted if known else named)}
+        is_clear = len(rivals) == 1
     if not is_clear:
         titles = map(title_of, counted, counted.values())
         p.put("label.column", UNKNOWN, "; ".join([*titles, doubt]))

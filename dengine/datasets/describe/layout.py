@@ -3,7 +3,6 @@
 import re
 from collections import Counter
 from dataclasses import replace
-from itertools import chain
 
 import numpy as np
 
@@ -48,7 +47,7 @@ def layout_of(p: Proposal, files: Tables) -> str:
     runs = [column for column in columns.values() if may_tell_parts(column)]
     stated = columns.keys() & {*p.description.part.column}
     if runs or not all(columns[name].fixed for name in stated):
-        likely = [c.name for c in runs if PART_NAME.search(c.name) and has_a_run_for_each_word(c)]
+        likely = [c.name for c in runs if PART_NAME.search(c.name) and len(c.counts) == c.n_runs]
         named = [n for n, c in columns.items() if PART_NAME.search(n) or has_long_runs(c)]
         note = f"one of {listed(named)}, or several"
         p.put("part.column", *(likely if len(likely) == 1 else (UNKNOWN, note)))
@@ -68,13 +67,8 @@ def has_long_runs(column: Column) -> bool:
 
     False if a cell is empty, or if no table has more than one word.
     """
-    is_long = column.counts.total() >= LEAST_RUN * len([*chain(*column.runs)])
+    is_long = column.counts.total() >= LEAST_RUN * column.n_runs
     return not column.fixed and is_long and "" not in column.counts
-
-
-def has_a_run_for_each_word(column: Column) -> bool:
-    """Return whether each word stands in one run of successive rows, in all tables together."""
-    return len(column.counts) == len([*chain(*column.runs)])
 
 
 def may_tell_parts(column: Column) -> bool:
@@ -90,7 +84,7 @@ def may_tell_parts(column: Column) -> bool:
     if PART_NAME.search(column.name):
         return all(len(words) == len({*words}) for words in column.runs)
     is_clock = CLOCK_NAME.search(column.name) is not None or bool(column.forms)
-    return not is_clock and has_a_run_for_each_word(column)
+    return not is_clock and len(column.counts) == column.n_runs
 
 
 def numbered_columns(table: Table) -> list[str]:

@@ -18,7 +18,7 @@ from ..read.split import match_numbered
 from ..units import quantity_of
 from .clock import NAME as CLOCK_NAME
 from .clock import is_clock, propose_clock, propose_rate
-from .columns import MOST_WORDS, Column, Proposal, columns_of, counts_of
+from .columns import LOST, MOST_WORDS, Column, Proposal, columns_of, counts_of
 from .labels import NAME, has_meaning, lines_of, part_words, propose_label
 from .layout import PART_NAME
 
@@ -150,21 +150,22 @@ def qualifies(column: Column, n_rows: int) -> bool:
     several must name a force or a torque. A column that is named like a status (`Status`, `valid`)
     may have numbers, and also just one word in all. Any other must have texts, or empty cells if it
     is named like a verdict, and no name like a clock. A column that is named like a verdict and has
-    one word in each recording, of which any is known to mean good or bad, holds labels instead, and
-    gives False.
+    one word in all, which is known to mean good or bad, holds labels instead, and gives False.
     """
-    name = column.name
     words = column.counts
-    is_named = QUALIFIER_NAME.search(name) is not None
-    is_verdict = NAME.fullmatch(name) is not None
+    is_named = QUALIFIER_NAME.search(column.name) is not None
+    is_verdict = NAME.fullmatch(column.name) is not None
     has_words = any(column.odd) or (is_verdict and column.odd)  # or beside empty cells, a number
-    is_text = has_words and not CLOCK_NAME.search(name)
-    is_signal = len(words) > 1 and any(SIGNAL.fullmatch(word) for word in words)
-    varies = not column.fixed or is_signal or (is_named and len(words) == 1)
     is_full = words.total() in (n_rows, len(column.fixed))  # a cell for each row, or recording
-    if not (is_named or is_text) or not varies or not is_full or len(words) > MOST_WORDS:
+    if not is_full or len(words) > MOST_WORDS:
         return False
-    return not (is_verdict and column.fixed and has_meaning(LabelSource(column=name), words))
+    if not is_named and (not has_words or CLOCK_NAME.search(column.name)):
+        return False
+    if not column.fixed:
+        return True
+    if len(words) > 1:
+        return any(map(SIGNAL.fullmatch, words))
+    return is_named and not (is_verdict and has_meaning(LabelSource(column=column.name), words))
 
 
 def propose_part(p: Proposal) -> None:
@@ -254,14 +255,14 @@ def find_lost(p: Proposal) -> None:
     missing = {*p.description.text.missing}
     strange = dict[str, int]()
     for name in p.description.channels:
-        column = p.columns[name]
-        n = column.counts.total()
-        lost = column.odd.keys() - column.strange.keys()
-        if p.description.time.column and column.counts[""] > SPARSE * n:
-            lost -= {""}
-            rows.setdefault(name, RowWords((ANY,), ("",)))
-        missing |= lost
-        strange |= {word: k for word, k in column.strange.items() if k > STRANGE * n}
+        n_cells = p.columns[name].counts.total()
+        for word, n in p.columns[name].odd.items():
+            if not word and p.description.time.column and n > SPARSE * n_cells:
+                rows.setdefault(name, RowWords((ANY,), ("",)))
+            elif word.lower() in LOST:
+                missing.add(word)
+            elif n > STRANGE * n_cells and word not in missing:
+                strange[word] = n
     set_rows(p, rows)
     p.put("text.missing", sorted(missing))
     if strange:
