@@ -51,7 +51,8 @@ NO_RECORDING = re.compile(
 BAG = ".mcap"
 MOST_FILES = 60  # that are read
 MOST_ROWS = 50_000
-MOST_SIGNALS = 4  # of a part, or pieces of its curve, that have a file each
+MOST_PIECES = 4  # of a part's curve, in files with numbers behind their names
+LEAST_PARTS = 10  # that have such pieces
 Names = Sequence[str]
 
 
@@ -137,21 +138,23 @@ def likely_endings(names: Names) -> Names:
     """Return the endings of file names of which one may tell the recordings from other files.
 
     They are the suffixes that several files have, and `.mcap` if one file has it; or else all. If
-    there is only one, the endings that tell signals or pieces of a curve apart come before it:
-    `Kraft.csv` of `1_Kraft.csv`, the last word with its suffix, behind the part. There must be 2 to
-    4 such endings, as many parts or more, and a file for each part with each ending. An ending that
-    is a word like `ok` or `pending` tells no signal.
+    there is only one, the endings that tell signals apart come before it: `Kraft.csv` of
+    `1_Kraft.csv`, the last word with its suffix, behind the part. There must be two parts and two
+    such endings or more, and each part must have a file with each ending. An ending that is a word
+    like `ok` or `pending` tells no signal. Endings with digits count only if there are 2 to 4 of
+    them and 10 parts or more: numbered pieces of a part's curve.
     """
     counts = Counter(map(suffix_of, names))
     likely = [suffix for suffix, n in counts.items() if n > 1 or suffix == BAG] or [*counts]
     words = [re.split(r"[-_ ](?=[^-_ /]+$)", name) for name in names]
     n_parts = len({name[0] for name in words})
     endings = sorted({name[-1] for name in words})
-    is_grid = n_parts * len(endings) == len(names) and 1 < len(endings) <= min(
-        n_parts, MOST_SIGNALS
-    )
-    is_verdict = re.search(rf"(?i)\b({WORD})\.", " ".join(endings))
-    return [*endings, *likely] if len(likely) == 1 and is_grid and not is_verdict else likely
+    is_grid = n_parts * len(endings) == len(names) and min(n_parts, len(endings)) > 1
+    no_signal = rf"(?i)\b({WORD})\."
+    if len(endings) > MOST_PIECES or n_parts < LEAST_PARTS:
+        no_signal += r"|\d"
+    is_signal = len(likely) == 1 and is_grid and not re.search(no_signal, " ".join(endings))
+    return [*endings, *likely] if is_signal else likely
 
 
 def suffix_of(name: str) -> str:

@@ -127,8 +127,8 @@ def _unit_by_size(column: Column, p: Proposal) -> str:
     1970 or from another day that clocks use, and the median of the steps above 0 gives a rate of
     1 Hz to 1 MHz; the first in `EPOCHS` counts. If none is, and this step is 0.0002 to 0.019, the
     unit is s, and a note on `time.format` in `p` says so. Otherwise it is `?`, and the note lists
-    the possible units. It is `?`, too, if the column has no numbers that rise; the note then asks
-    for the form of its cells.
+    units with the rates that they give. It is `?`, too, if the column has no numbers that rise; the
+    note then asks for the form of its cells.
     """
     rising = np.abs(column.steps[column.steps != 0])  # or falling, with the newest row first
     if not len(rising):

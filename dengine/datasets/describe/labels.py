@@ -193,16 +193,16 @@ def words_of(p: Proposal, source: LabelSource, tables: Tables, parts: Words) -> 
 
     `tables` has the table of each recording, and `parts` their part numbers. If a listing has
     several rows for a recording, it is the word of the first. If no recording has a word, also
-    because the source's listing cannot be read, or its `path` is no regular expression with one
-    group, DataError is raised for the stated source; any other then gives an empty mapping.
+    because `source.path` is no regular expression with one group, DataError is raised for the
+    stated source; any other then gives an empty mapping. Raises DataError if the source's listing
+    cannot be read.
     """
     words = dict[str, str]()
     faults = list[Fault]()
-    with caught(faults, source.listing):
-        reader = read_labels(p.base, source, p.description.text)
-        for table in tables:
-            with caught(faults, table.source):
-                words[table.source] = reader.words(table, parts.get(table.source, ""))[0]
+    reader = read_labels(p.base, source, p.description.text)
+    for table in tables:
+        with caught(faults, table.source):
+            words[table.source] = reader.words(table, parts.get(table.source, ""))[0]
     if source == p.description.label and not words:
         raise DataError(f"Expected words where [label] says they stand, found none. {faults[0]}.")
     return words

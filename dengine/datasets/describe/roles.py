@@ -72,7 +72,7 @@ def propose_roles(p: Proposal) -> None:
     propose_clock(p)
     propose_part(p)
     propose_label(p)
-    propose_channels(p, _units(p))
+    propose_channels(p, {column.name: column.unit for column in p.unused if may_be_channel(column)})
     find_lost(p)
     clock = p.description.time
     if any(UNKNOWN in about.keep for about in p.description.rows.values()):
@@ -226,19 +226,14 @@ def _doubt_on(p: Proposal, name: str) -> str:
     return f"{name} is not numbered evenly at {columns[steps.argmax() + 1][0]}"
 
 
-def _units(p: Proposal) -> dict[str, str]:
-    """Return the columns that may be channels, with their units; "" for no unit.
+def may_be_channel(column: Column) -> bool:
+    """Return whether a column may be a channel, if it has no other use in the description.
 
-    Such a column has no other use in the description so far, and at least three different numbers.
-    Times, columns named like counters of rows, and columns that are constant in each recording are
-    left out. Raises SettingError for a malformed `windows.trigger`.
+    It must have at least three different numbers, change within a recording, and be no times and
+    not named like a counter of rows.
     """
-    units = dict[str, str]()
-    for column in p.unused:
-        is_other = is_clock(column) or COUNTER_NAME.fullmatch(column.name) or column.fixed
-        if not is_other and len(column.counts) - len(column.odd) > 2:
-            units[column.name] = column.unit
-    return units
+    is_other = is_clock(column) or COUNTER_NAME.fullmatch(column.name) or column.fixed
+    return not is_other and len(column.counts) - len(column.odd) > 2
 
 
 def find_lost(p: Proposal) -> None:
