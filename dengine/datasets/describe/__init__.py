@@ -30,7 +30,7 @@ from .columns import Proposal, Stated, Tables
 from .labels import WORD
 from .layout import layout_of, parts_of
 from .roles import propose_roles
-from .text_form import MOST_BYTES, decode, propose_form
+from .text_form import MOST_BYTES, propose_form
 
 TEXTS = (".csv", ".tsv", ".txt", ".dat", ".asc", ".lvm", ".log", ".prn")
 # The format of files with each suffix; `.gz` may stand behind it.
@@ -79,11 +79,11 @@ def describe(source: Any, stated: Stated | None = None) -> Description:
     Raises
     ------
     DataError
-        If there is no file, or none that can be read and holds samples (a table of results does
-        not), or if the package that reads such files is not installed. Also if a stated value is
-        wrong: an unknown key or a value of the wrong type, a column of times or a channel that does
-        not exist, a source of labels that has no words, a malformed pattern of files, or settings
-        in `[text]` or `[time]` that no file can be read with.
+        If there is no file, or none that can be read and holds samples, or if the package that
+        reads such files is not installed. Also if a stated value is wrong: an unknown key or a
+        value of the wrong type, a column of times or a channel that does not exist, a source of
+        labels that has no words, a malformed pattern of files, or settings in `[text]` or `[time]`
+        that no file can be read with.
     SettingError
         If a stated `windows.trigger`, which cuts long recordings, is malformed.
     ValueError
@@ -150,12 +150,10 @@ def likely_endings(names: Names) -> Names:
     n_parts = len({name[0] for name in words})
     endings = sorted({name[-1] for name in words})
     is_grid = n_parts * len(endings) == len(names) and min(n_parts, len(endings)) > 1
-    may_be_pieces = len(endings) <= MOST_PIECES and n_parts >= LEAST_PARTS
-    text = " ".join(endings)
-    is_other = re.search(rf"(?i)\b({WORD})\.", text) or (
-        re.search(r"\d", text) and not may_be_pieces
-    )
-    is_signal = len(likely) == 1 and is_grid and not is_other
+    no_signal = rf"(?i)\b({WORD})\."
+    if len(endings) > MOST_PIECES or n_parts < LEAST_PARTS:
+        no_signal += r"|\d"
+    is_signal = len(likely) == 1 and is_grid and not re.search(no_signal, " ".join(endings))
     return [*endings, *likely] if is_signal else likely
 
 
@@ -234,8 +232,7 @@ def table_in(p: Proposal, content: bytes, name: str) -> Table:
     """
     about = p.description
     if about.format in ("text", "jsonl") and len(content) > MOST_BYTES:
-        encoding = about.text.encoding
-        content = decode(content, encoding)[1].rpartition("\n")[0].encode(encoding) or content
+        content = content[:MOST_BYTES].rpartition(b"\n")[0] or content
         p.is_cut = True
     if about.format == "text":
         table = read_text(content, name, about.text)
@@ -256,9 +253,9 @@ def propose_tables(p: Proposal, files: Tables) -> None:
     without damage, with only the rows that are samples, `p.columns` their columns, and `p.names` is
     emptied unless each file is one part. If the layout or `part.column` is `?`, nothing more is
     proposed: `p.tables` and `p.names` stay, and a note on `channels` says why. Raises DataError if
-    there is no part without damage, or only a table of results, if the tables do not split as a
-    stated layout says, or if a stated column, setting in `[time]` or source of labels is wrong, and
-    SettingError for a malformed `windows.trigger`.
+    there is no part without damage, if the tables do not split as a stated layout says, or if a
+    stated column, setting in `[time]` or source of labels is wrong, and SettingError for a
+    malformed `windows.trigger`.
     """
     p.is_cut |= any(len(table.lines) > MOST_ROWS for table in files)
     files = [table.take(slice(MOST_ROWS)) for table in files]

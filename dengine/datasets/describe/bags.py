@@ -8,12 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from ...errors import DataError
-from ..dataset import Fault
 from ..description import UNKNOWN, LabelSource
 from ..read.bags import LOG_TIME, STAMP, read_messages
-from ..read.files import caught
-from ..table import Table
+from ..table import Table, UnreadableError
 from .clock import propose_rate
 from .columns import Proposal, counts_of
 from .labels import with_meanings
@@ -42,9 +39,8 @@ def propose_bag(p: Proposal) -> None:
     times, words = defaultdict[str, list[int]](list), defaultdict[str, list[str]](list)
     units = dict[str, str]()
     is_stamped = True
-    faults = list[Fault]()
-    with caught(faults, p.names[0]):
-        messages = read_messages(p.base / p.names[0], None)
+    messages = read_messages(p.base / p.names[0], None)
+    try:
         for topic, logged, message in islice(messages, MOST_MESSAGES):
             times[topic].append(logged)
             if hasattr(message, "data"):
@@ -52,8 +48,9 @@ def propose_bag(p: Proposal) -> None:
             elif len(times[topic]) == 1:
                 units |= dict(_fields(message, topic))
                 is_stamped &= hasattr(message, "header") and message.header.stamp.sec > 0
-    if faults and not times:
-        raise DataError(f"Expected a bag: {faults[0]}")
+    except UnreadableError:  # the messages before the damage are enough
+        if not times:
+            raise
     propose_channels(p, units)
     channels = [*p.description.channels]
     p.put("ignored", {name: unit for name, unit in units.items() if name not in channels})

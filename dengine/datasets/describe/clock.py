@@ -64,18 +64,18 @@ def propose_clock(p: Proposal) -> None:
     their forms are found. Of a column that is set `time.format` may be `?` (`form_of`). Raises
     SettingError for a malformed `windows.trigger`.
     """
-    clocks = [column for column in p.columns.values() if is_clock(column)]
+    clocks = [*filter(is_clock, p.unused)]
     if is_stated := "time.column" in p.stated:
         clocks = [p.columns[name] for name in p.description.time.column]
     has_days = any(has_day(form) for column in clocks for form in column.forms)
     coarse = [c for c in p.unused if c.forms or (NAME.search(c.name) and len({*c.fixed}) > 1)]
-    names = [c.name for c in p.columns.values() if c in clocks or (c in coarse and not has_days)]
+    names = [c.name for c in p.unused if c in clocks or (c in coarse and not has_days)]
     if not clocks:
         has_no_names = "c0" in p.description.text.names or "s" in p.columns  # may be the stroke
         names = [*p.columns] if has_no_names else [c.name for c in p.unused if is_counter(c)]
     if clocks and (is_stated or len(names) == 1):
         p.put("time.column", [column.name for column in clocks])
-        p.put("time.format", [form_of(column, p, len(clocks) == 1) for column in clocks])
+        p.put("time.format", [form_of(column, p) for column in clocks])
     elif names:
         text = f"of {listed(names)}: one, several that are added (a date, a time, ms), or []: none"
         p.put("time.column", UNKNOWN, text)
@@ -131,21 +131,17 @@ def epoch_of(column: Column) -> str:
     return ""
 
 
-def form_of(column: Column, p: Proposal, is_alone: bool) -> str:
+def form_of(column: Column, p: Proposal) -> str:
     """Return the unit or the form of a column of times; `?` if none is certain.
 
     The form of dates or times of day comes first, then the unit that dates of today prove
     (`epoch_of`), the unit that the file states, the one in the column's name, like `ms` of `t
     [ms]`, `t in 0.1 ms` or `millis`, and what the size of the numbers proves. A note on
     `time.format` in `p` says why it is `?`, or that only the size of the numbers says s. If several
-    forms of dates fit, so that day and month can be confused, the form is `?`; but if another
-    column tells a part of the time, too, and all recordings have one and the same date, it is the
-    first of these forms.
-
-    is_alone : whether no other column tells a part of the time.
+    forms of dates fit, so that day and month can be confused, the form is `?`.
     """
     forms = column.forms
-    if len(forms) > 1 and (is_alone or len({*column.fixed}) != 1):
+    if len(forms) > 1:
         p.notes["time.format"] = f"{listed(forms)}: the cells prove neither"
         return UNKNOWN
     units = [*forms, epoch_of(column), column.unit]
@@ -164,8 +160,8 @@ def _unit_by_size(column: Column, p: Proposal) -> str:
     """Return the unit of time that the steps in a column prove; `?`, with a note, if none.
 
     If the median of the steps is 0.0002 to 0.019, the unit is s, and a note on `time.format` in `p`
-    says so. Otherwise it is `?`, and the note lists the possible units. It is `?`, too, if the
-    column has no numbers that rise; the note then asks for the form of its cells.
+    says so. Otherwise it is `?`, and the note lists units with the rates that they give. It is `?`,
+    too, if the column has no numbers that rise; the note then asks for the form of its cells.
     """
     rising = np.abs(column.steps[column.steps != 0])  # or falling, with the newest row first
     if not len(rising):
@@ -178,9 +174,8 @@ def _unit_by_size(column: Column, p: Proposal) -> str:
     if SECONDS[0] <= step <= SECONDS[1]:
         p.notes["time.format"] = f"seconds, for steps of {step:.6g}; the unit is not stated"
         return "s"
-    steps = {unit: step * UNITS[unit] for unit in ("s", "ms", "us", "ns", "min")}
-    rates = ", ".join(f"{unit} ({1 / s:.6g} Hz)" for unit, s in steps.items() if is_rate(s))
-    p.notes["time.format"] = f"steps of {step:.6g}, the unit is not stated: {rates}"
+    rates = [f"{unit} ({1 / step / UNITS[unit]:.6g} Hz)" for unit in ("s", "ms", "us", "ns", "min")]
+    p.notes["time.format"] = f"steps of {step:.6g}, the unit is not stated: {', '.join(rates)}"
     return UNKNOWN
 
 
@@ -192,15 +187,15 @@ def is_rate(step: float) -> bool:
 def propose_rate(p: Proposal, tables: Tables) -> None:
     """Set `time.rate_hz` in `p`, from the median over the recordings of the mean step of time.
 
-    `tables` has the samples of each recording. If the times of more than 90 % of them end before
-    they begin, `time.sort` is set. Steps below 0 are left out of the mean, and the rate is rounded
-    to five digits. It is `?`, with a note, if it is not between 1 Hz and 1 MHz; then
-    `time.gap`, the longest step that is allowed, is not looked at. Otherwise `check_steps` checks
-    the times, by the rate and the gap that the description has by then. If it refuses more
-    recordings than 10 % plus one, `time.gap` is set to `?`, with a note on the first. If all
-    recordings start after 1999 (UTC), `order` is set to `time`, also if the rate is `?`. Recordings
-    whose times cannot be read are skipped. Stated keys stay. Raises DataError if a stated format is
-    no form or unit of times, or if a setting in `[time]` is wrong (see `check_forms`).
+    `tables` has the samples of each recording. Steps below 0 are left out of the mean, unless the
+    user stated `time.sort`, and the rate is rounded to five digits. It is `?`, with a note, if it
+    is not between 1 Hz and 1 MHz, like that of times that only fall; then `time.gap`, the longest
+    step that is allowed, is not looked at. Otherwise `check_steps` checks the times, by the rate
+    and the gap that the description has by then. If it refuses more recordings than 10 % plus one,
+    `time.gap` is set to `?`, with a note on the first. If all recordings start after 1999 (UTC),
+    `order` is set to `time`, also if the rate is `?`. Recordings whose times cannot be read are
+    skipped. Stated keys stay. Raises DataError if a stated format is no form or unit of times, or
+    if a setting in `[time]` is wrong (see `check_forms`).
     """
     clock = p.description.time
     check_forms(clock, p.description.text)
@@ -208,18 +203,18 @@ def propose_rate(p: Proposal, tables: Tables) -> None:
     for table in tables:
         with suppress(UnreadableError):
             clocks.append((table, times_of(table, clock, p.description.text)))
-    if clocks and np.mean([seconds[-1:] < seconds[:1] for _, seconds in clocks]) > 1 - FEW:
-        p.put("time.sort", True, "the newest row is the first")
-    if p.description.time.sort:
+    if clock.sort:
         clocks = [(table, np.sort(seconds)) for table, seconds in clocks]
-    rising = [steps[steps >= 0] for steps in (np.diff(seconds) for _, seconds in clocks)]
     if min((seconds[0] for _, seconds in clocks), default=0.0) > YEARS[0]:
         p.put("order", "time")
-    usual = float(np.median([steps.mean() for steps in rising if len(steps)] or 0.0))
+    steps = [np.diff(seconds) for _, seconds in clocks]
+    means = [s[s >= 0].mean() for s in steps if (s >= 0).any()]
+    usual = float(np.median(means or 0.0))
     if not is_rate(usual):
         text = (
-            f"steps of {usual:.6g} s are of no force: is time.format right? A footer is left out "
-            "with text.drop, the words that it begins with"
+            f"steps of {usual:.6g} s are of no force: is time.format right? If the newest row is "
+            "the first, state time.sort=true. A footer is left out with text.drop, the words that "
+            "it begins with"
         )
         p.put("time.rate_hz", UNKNOWN, text)
         return

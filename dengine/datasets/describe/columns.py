@@ -6,6 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property
+from itertools import groupby
 from pathlib import Path
 from statistics import mode
 from typing import Any
@@ -80,30 +81,24 @@ class Column:
         return Counter(np.concatenate(self.words).tolist())
 
     @cached_property
-    def odd(self) -> Counter[str]:
+    def odd(self) -> dict[str, int]:
         """How often each word comes that is no number with any decimal mark; "" is such a word."""
-        return Counter({w: n for w, n in self.counts.items() if not NUMBER.fullmatch(w)})
+        return {word: n for word, n in self.counts.items() if not NUMBER.fullmatch(word)}
 
     @cached_property
-    def strange(self) -> Counter[str]:
-        """How often each word comes that is no number and does not mean a lost sample.
+    def runs(self) -> list[list[str]]:
+        """The word of each run of successive rows with one word, in each recording."""
+        return [[word for word, _ in groupby(words)] for words in self.words]
 
-        These are the words in `odd`, which are no numbers with any decimal mark, without those in
-        `LOST`, in any case of letters, and in `text.missing`.
-        """
-        return Counter(
-            {
-                word: n
-                for word, n in self.odd.items()
-                if word.lower() not in LOST and word not in self.form.missing
-            }
-        )
+    @cached_property
+    def n_runs(self) -> int:
+        """The number of runs of successive rows with one word, in all recordings together."""
+        return sum(map(len, self.runs))
 
     @cached_property
     def fixed(self) -> list[str]:
         """The word of each recording; empty if one has several words or no rows."""
-        is_fixed = all(len(words) and (words == words[0]).all() for words in self.words)
-        return [str(words[0]) for words in self.words] if is_fixed else []
+        return [words[0] for words in self.runs] if {*map(len, self.runs)} == {1} else []
 
     @cached_property
     def numbers(self) -> list[Floats]:

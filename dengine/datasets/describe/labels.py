@@ -10,7 +10,6 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from itertools import permutations
-from typing import Any
 
 from ...errors import DataError
 from ..dataset import Fault
@@ -64,7 +63,6 @@ PLACES = (  # of any words: folders, and the words of a file's name, counted fro
 NO_LABEL = "none was found that is certain: state label.column, path, line or listing"
 Names = Iterable[str]
 Words = Mapping[str, str]  # by recording
-Meanings = Mapping[str, int | None]  # by recording: 1 good, 0 bad, None unchecked
 
 
 def with_meanings(source: LabelSource, words: Names) -> LabelSource:
@@ -72,7 +70,7 @@ def with_meanings(source: LabelSource, words: Names) -> LabelSource:
 
     A list that the source has already stays; the others get the words of known meaning, like "ok",
     in any case of letters. Then `good` or `bad` becomes `?` if it would be empty: that all files
-    say `OK` alone proves nothing. True, yes or 1 and their opposites, alone or with words for
+    say `OK` proves nothing. True, yes or 1 and their opposites, alone or with words for
     unchecked, have known meanings only if the name of the column, line or topic is one for good,
     like `success`, not `failed`; in a path that takes any word they have none. Beside other words,
     and in a path whose expression lists its words, true means good and false bad, whatever the name
@@ -80,17 +78,16 @@ def with_meanings(source: LabelSource, words: Names) -> LabelSource:
     """
     words = sorted({*words})
     name = source.column or source.line or source.topic or ("([^" in source.path and source.path)
-    verdicts: Sequence[Sequence[str]] = (GOOD, BAD)
+    groups: Sequence[Sequence[str]] = (GOOD, BAD, UNCHECKED)
     if name and {word.lower() for word in words} <= {*YES, *NO, *UNCHECKED}:
-        verdicts = (YES, NO) if GOOD_NAME.fullmatch(name) else ((), ())
-    about: dict[str, Any] = {
-        key: getattr(source, key) or tuple(word for word in words if word.lower() in group)
-        for key, group in zip(("good", "bad", "unchecked"), (*verdicts, UNCHECKED), strict=True)
-    }
-    is_one_sided = not (about["good"] and about["bad"])
-    if is_one_sided or {*words}.difference(*about.values()):
-        about |= {key: about[key] or (UNKNOWN,) for key in ("good", "bad")}
-    return replace(source, **about)
+        groups = (YES, NO, UNCHECKED) if GOOD_NAME.fullmatch(name) else ((), (), UNCHECKED)
+    goods, bads, others = (tuple(w for w in words if w.lower() in group) for group in groups)
+    return replace(
+        source,
+        good=source.good or goods or (UNKNOWN,),
+        bad=source.bad or bads or (UNKNOWN,),
+        unchecked=source.unchecked or others,
+    )
 
 
 def has_meaning(source: LabelSource, words: Names) -> bool:
@@ -198,17 +195,17 @@ def words_of(p: Proposal, source: LabelSource, tables: Tables, parts: Words) -> 
     """Return the word of each recording that has one in a source, by its `Table.source`.
 
     `tables` has the table of each recording, and `parts` their part numbers. A recording for which
-    a listing has rows with different words has none. If no recording has a word, also because the
-    source's listing cannot be read, or its `path` is no regular expression with one group,
-    DataError is raised for the stated source; any other then gives an empty mapping.
+    a listing has rows with different words has none. If no recording has a word, also because
+    `source.path` is no regular expression with one group, DataError is raised for the stated
+    source; any other then gives an empty mapping. Raises DataError if the source's listing cannot
+    be read.
     """
     words = dict[str, str]()
     faults = list[Fault]()
-    with caught(faults, source.listing):
-        reader = read_labels(p.base, source, p.description.text)
-        for table in tables:
-            with caught(faults, table.source):
-                words[table.source] = reader.word(table, parts.get(table.source, ""))
+    reader = read_labels(p.base, source, p.description.text)
+    for table in tables:
+        with caught(faults, table.source):
+            words[table.source] = reader.word(table, parts.get(table.source, ""))
     if source == p.description.label and not words:
         raise DataError(f"Expected words where [label] says they stand, found none. {faults[0]}.")
     return words
@@ -251,47 +248,41 @@ def count_sources(p: Proposal, stated: Sequence[LabelSource]) -> dict[LabelSourc
     return counted
 
 
-def meanings_of(source: LabelSource, words: Words) -> Meanings:
-    """Return, by recording, 1 for a word for good, 0 for bad and None for unchecked.
-
-    The source has the lists of these words, and `words` the word of each recording. The dict is
-    empty if a word is in no list, or if none is for good or bad.
-    """
-    known = source.meanings
-    if not {*words.values()} <= known.keys():
-        return {}
-    meanings = {name: known[word] for name, word in words.items()}
-    return meanings if {*meanings.values()} - {None} else {}
-
-
 def propose_label(p: Proposal) -> None:
     """Set `[label]` and `[[check]]` in `p`: the source of the labels, and those that must agree.
 
-    A source is known if it is named like a verdict or stated, and all its words have a known
-    meaning. The first known source becomes the label, unless another source contradicts it, or it
-    has words for good or for bad only while a source that is not known may hold labels, too. If
-    none is known, but only one is named like a verdict, that becomes the label, with `?` for words
-    whose meaning is open. Otherwise `label.column` is `?`, with a note that lists all sources.
-    Further known sources that have a word for each recording of the label become checks, unless
-    checks are stated; a note counts the words of the label, also on `label.good` and `label.bad` if
-    these are `?`. Raises DataError if a stated source has no words or cannot be read, and
-    SettingError for a malformed `windows.trigger`.
+    A source is certain if it is named like a verdict or stated, has words for good and for bad, and
+    all its words have a known meaning. The first certain source becomes the label, unless another
+    source contradicts it. If none is certain, but only one is named like a verdict, that becomes
+    the label, with `?` for words whose meaning is open; but if it has only known words, like "ok",
+    this holds only if there is no other source. Otherwise `label.column` is `?`, with a note that
+    lists all sources. Further certain sources that have a word for each recording of the label
+    become checks, unless checks are stated; a note counts the words of the label, also on
+    `label.good` and `label.bad` if these are `?`. Raises DataError if a stated source has no words
+    or cannot be read, and SettingError for a malformed `windows.trigger`.
     """
     label = p.description.label
     stated = [label] if any(getattr(label, kind) for kind in SOURCES) else []
     counted = count_sources(p, stated)
-    meanings = {source: meanings_of(source, words) for source, words in counted.items()}
     named = [source for source in counted if stated or is_named_like_verdict(source)]
-    certain = [source for source in named if meanings[source]]
-    is_clear = len(named) == 1
+    meanings = {
+        source: {name: source.meanings.get(word, UNKNOWN) for name, word in words.items()}
+        for source, words in counted.items()
+    }
+    known = [source for source in named if UNKNOWN not in meanings[source].values()]
+    certain = [source for source in known if UNKNOWN not in source.good + source.bad]
     doubt = NO_LABEL
     if certain:
         first = meanings[certain[0]]
-        n_odd = max(_count_contradictions(first, other) for other in meanings.values())
-        has_both = {0, 1} <= {*first.values()}
-        is_clear = n_odd == 0 and (has_both or len(certain) == len(counted))
-        if n_odd:
-            doubt = f"two of these disagree on {n_odd:,} of {len(first):,} recordings"
+        n_odd = max(  # recordings that are good by one source and bad by the other
+            sum({meaning, others.get(name)} == {0, 1} for name, meaning in first.items())
+            for others in meanings.values()
+        )
+        is_clear = n_odd == 0
+        doubt = f"two of these disagree on {n_odd:,} of {len(first):,} recordings"
+    else:
+        rivals = {tuple(counted[source].items()) for source in (counted if known else named)}
+        is_clear = len(rivals) == 1
     if not is_clear:
         titles = map(title_of, counted, counted.values())
         p.put("label.column", UNKNOWN, "; ".join([*titles, doubt]))
@@ -301,12 +292,7 @@ def propose_label(p: Proposal) -> None:
     checks = tuple(source for source in certain[1:] if counted[source].keys() >= words.keys())
     p.description = replace(p.description, label=label, check=p.description.check or checks)
     place = next(kind for kind in SOURCES if getattr(label, kind))
-    unclear = [key for key in ("good", "bad") if UNKNOWN in getattr(label, key)]
     note = f"{counts_of(words.values())}, over {len(words):,} recordings"
     p.notes[f"label.{place}"] = note
-    p.notes |= {f"label.{key}": f"which of the words? {note}" for key in unclear}
-
-
-def _count_contradictions(meanings: Meanings, others: Meanings) -> int:
-    """Return how many recordings are good by one of two sources of labels and bad by the other."""
-    return sum({label, others.get(name)} == {0, 1} for name, label in meanings.items())
+    unclear = [key for key in ("good", "bad") if UNKNOWN in getattr(label, key)]
+    p.notes |= {f"label.{key}": f"which words? {note}" for key in unclear}

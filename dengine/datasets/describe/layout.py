@@ -2,16 +2,14 @@
 
 import re
 from collections import Counter
-from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
 
-from ...errors import DataError, listed
+from ...errors import listed
 from ..description import ANY, UNKNOWN, Channel, TextForm
-from ..read.split import OBJECTS, has_lists, split
+from ..read.split import OBJECTS, split
 from ..table import Table
-from . import labels
 from .clock import NAME as CLOCK_NAME
 from .columns import LEAST_RUN, Column, Proposal, Tables, columns_of
 
@@ -28,46 +26,40 @@ def layout_of(p: Proposal, files: Tables) -> str:
     """Return how the files hold parts, as `Description.layout` names it; `?` if it is not certain.
 
     `files` has the table of each file that is looked at. These rules come one after another.
-    Several JSON or .ts files, of which the first has one row, are `files`. Lists in the first row
-    of the first table, or 20 or more columns like `x0`, `x1`, make it `wide`, or `npz` for an .npz
-    file. It is `long` if a column of the first table may tell the parts apart (`may_tell_parts`),
-    or if a file has several words of a stated `part.column`; unless it is stated, `part.column` is
-    then set in `p` to the only such column with a name like that of a part's number and no word in
-    two files, or to `?` with a note. Several files, of which `p.names` may have more than were
-    looked at, are `files`. A single one gives `?`, with a note on what to state, or DataError if it
-    is a table of results: one row for each part, with its label, and no samples. Raises
-    UnreadableError if cells of columns that are looked at are lists.
+    Several JSON or .ts files, of which the first has one row, are `files`. Lists of two items or
+    more in the first row of the first table, or 20 or more columns like `x0`, `x1`, make it `wide`,
+    or `npz` for an .npz file. It is `long` if a column of the first table may tell the parts apart
+    (`may_tell_parts`), or if a file has several words of a stated `part.column`; unless it is
+    stated, `part.column` is then set in `p` to the only such column with a name like that of a
+    part's number and no word in two files, or to `?` with a note. Several files, of which `p.names`
+    may have more than were looked at, are `files`. A single one gives `?`, with a note on what to
+    state. Raises UnreadableError if cells of columns that are looked at are lists.
     """
     kind = p.description.format
     first = files[0]
     if kind in OBJECTS and len(p.names) > 1 and len(first.lines) == 1:
         return "files"
-    if numbered_columns(first) or has_lists(first):
+    cells = [cell for column in first.columns.values() for cell in column[:1]]
+    has_lists = any(isinstance(cell, list | np.ndarray) and len(cell) > 1 for cell in cells)
+    if has_lists or numbered_columns(first):
         return "npz" if kind == "npz" else "wide"
     columns = columns_of(files, TextForm())
-    runs = [name for name, column in columns.items() if may_tell_parts(column)]
-    stated = [columns[name] for name in p.description.part.column if name in columns]
-    if runs or any(words_in(column) > len(files) for column in stated):
-        unique = [name for name in runs if words_in(columns[name]) == len(columns[name].counts)]
-        likely = [*filter(PART_NAME.search, unique)]
-        named = [*filter(PART_NAME.search, columns)]
-        named += [name for name, column in columns.items() if has_long_runs(column)]
-        note = f"one of {listed(dict.fromkeys(named))}, or several"
+    runs = [column for column in columns.values() if may_tell_parts(column)]
+    stated = columns.keys() & {*p.description.part.column}
+    if runs or not all(columns[name].fixed for name in stated):
+        likely = [c.name for c in runs if PART_NAME.search(c.name) and len(c.counts) == c.n_runs]
+        named = [n for n, c in columns.items() if PART_NAME.search(n) or has_long_runs(c)]
+        note = f"one of {listed(named)}, or several"
         p.put("part.column", *(likely if len(likely) == 1 else (UNKNOWN, note)))
         return "long"
     if len(p.names) > 1:  # of large files only the first one is looked at
         return "files"
-    _refuse_results(columns.values())
-    p.notes["layout"] = f"columns, a part in each, or long: part.column is of {listed(columns)}"
+    p.notes["layout"] = (
+        f"columns, a part in each; or long: part.column is of {listed(columns)}, and with "
+        "time.sort=true if the rows of parts are mixed. A row for each part, with its label, but "
+        "no curve is a table of results: nothing can be read"
+    )
     return UNKNOWN
-
-
-def runs_in(column: Column) -> int:
-    """Return the number of runs in all tables; a run is one word in successive rows.
-
-    A table without rows counts as one run.
-    """
-    return sum(int((words[1:] != words[:-1]).sum()) + 1 for words in column.words)
 
 
 def has_long_runs(column: Column) -> bool:
@@ -75,13 +67,8 @@ def has_long_runs(column: Column) -> bool:
 
     False if a cell is empty, or if no table has more than one word.
     """
-    is_long = column.counts.total() >= LEAST_RUN * runs_in(column)
+    is_long = column.counts.total() >= LEAST_RUN * column.n_runs
     return not column.fixed and is_long and "" not in column.counts
-
-
-def words_in(column: Column) -> int:
-    """Return the number of different words in each table, added up over the tables."""
-    return sum(len({*words}) for words in column.words)
 
 
 def may_tell_parts(column: Column) -> bool:
@@ -95,9 +82,9 @@ def may_tell_parts(column: Column) -> bool:
     if not has_long_runs(column):
         return False
     if PART_NAME.search(column.name):
-        return words_in(column) == runs_in(column)
+        return all(len(words) == len({*words}) for words in column.runs)
     is_clock = CLOCK_NAME.search(column.name) is not None or bool(column.forms)
-    return not is_clock and len(column.counts) == runs_in(column)
+    return not is_clock and len(column.counts) == column.n_runs
 
 
 def numbered_columns(table: Table) -> list[str]:
@@ -107,25 +94,6 @@ def numbered_columns(table: Table) -> list[str]:
     """
     counts = Counter(NUMBER.sub(ANY, name) for name in table.columns)
     return [pattern for pattern, n in counts.items() if n >= LEAST_NUMBERED]
-
-
-def _refuse_results(columns: Iterable[Column]) -> None:
-    """Raise DataError for a table of results: a row for each part, with its label, but no samples.
-
-    `columns` are those of a single table. One shows this if it has known words for good and for
-    bad, maybe among other words, and somewhere between two changes one word stands in fewer than 8
-    successive rows.
-    """
-    for column in columns:
-        edges = np.flatnonzero(column.words[0][1:] != column.words[0][:-1])
-        is_short = min(np.diff(edges), default=LEAST_RUN) < LEAST_RUN
-        words = {word.lower() for word in column.counts if is_short}
-        if words.intersection(labels.GOOD) and words.intersection(labels.BAD):
-            raise DataError(
-                f"Expected the samples of each part in {column.tables[0].source}, got a row for "
-                f"each result, with its verdict in {column.name}, and no curve; if the rows of "
-                "parts are mixed, state part.column and time.sort=true."
-            )
 
 
 def parts_of(p: Proposal, files: Tables) -> list[Table]:

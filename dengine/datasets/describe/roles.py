@@ -12,18 +12,19 @@ import numpy as np
 from ...errors import DataError, listed
 from ..description import ANY, UNKNOWN, LabelSource, PartSource, RowWords, expect_one_of
 from ..read.files import natural_key
+from ..read.places import without_label, without_suffix
 from ..read.recordings import is_dropped, kept_rows
 from ..read.split import match_numbered
 from ..units import quantity_of
 from .clock import COUNTER_NAME, is_clock, propose_clock, propose_rate
 from .clock import NAME as CLOCK_NAME
-from .columns import FORCES, MOST_WORDS, Column, Proposal, columns_of, counts_of
+from .columns import FORCES, LOST, MOST_WORDS, Column, Proposal, columns_of, counts_of
 from .labels import NAME, has_meaning, lines_of, part_words, propose_label
 from .layout import PART_NAME
-from .order import propose_order
 
 SPARSE = 0.1
 STRANGE = 0.01
+MOST_STEP = 1.5  # from one number of a column like `x0`, `x1` to the next, in usual steps
 PART_LINE = re.compile(
     r"(?i)serial|(?<!fixture )barcode|dmc|part ?(no|num|id)|teilenummer|werkst.ck(?!tr)|serien"
 )
@@ -37,6 +38,18 @@ SENTINEL = re.compile(r"(?i)-?9{4,}([.,]0+)?|-999[.,]25|-?1([.,]0+)?e\+?3\d|3[.,
 SCALE_NAME = re.compile(r"(?i)(^|[^a-z])(unit|einheit|scale|factor|faktor|.*rate)s?($|[^a-z])")
 SET_VALUE = re.compile(r"(?i)(^|[^a-z])(set|soll|vorgabe|nominal|target|consigne|max|min|limit)")
 
+# Dates in names. Those in the group `odd` are not sorted by name: they have the day or the month
+# first, the month as a word, or AM and PM.
+DATE = re.compile(
+    r"(?i)(?P<odd>(?<![a-z])(jan|feb|m[aä]r|apr|ma[iy]|jun|jul|aug|sep|o[ck]t|nov|de[cz])(?![a-z])"
+    r"|\d ?[ap]m(?![a-z])|(?<!\d)\d\d?([-_])\d\d?\3(19|20)\d\d(?!\d)"
+    r"|(?<!\d)[0-3]\d[01]\d20[0-3]\d(?!\d))|(?<!\d)(19|20)\d\d([-_.]?)[01]\d\6[0-3]\d"
+)
+ODD = (
+    "name, if that is the order; the names have dates that are sorted otherwise: rename the files, "
+    "with year, month and day in front"
+)
+
 
 def propose_roles(p: Proposal) -> None:
     """Find what each column is for, and set the keys that say so in `p`.
@@ -45,11 +58,13 @@ def propose_roles(p: Proposal) -> None:
     clock, part, label, channels, and what follows from these: words for lost samples, rate, length
     of the traces, order, ignored columns and files. A key is `?` if no rule proves a value. If it
     is open which rows are samples, `traces.samples` is `?` and no rate is set; a clock with `?`
-    gives no rate either. Stated keys stay, but a stated `ignored` is replaced (`list_others`), and
-    a stated `[rows]` gets further columns and words (`qualify_rows`, `find_lost`). `p.columns` is
-    set, and `p.tables` loses rows that are no samples. Raises DataError if a stated column of times
-    or channel does not exist, a setting in `[time]` is wrong, or a stated source of labels has no
-    words or cannot be read, and SettingError for a malformed `windows.trigger`.
+    gives no rate either. `ignored` becomes the columns without any use, with their units, and
+    `exclude` the files in `p.others` without listings of labels, unless it is `?`. Stated keys
+    stay, but a stated `ignored` is replaced, and a stated `[rows]` gets further columns and words
+    (`qualify_rows`, `find_lost`). `p.columns` is set, and `p.tables` loses rows that are no
+    samples. Raises DataError if a stated column of times or channel does not exist, a setting in
+    `[time]` is wrong, or a stated source of labels has no words or cannot be read, and SettingError
+    for a malformed `windows.trigger`.
     """
     p.columns = columns_of(p.tables, p.description.text)
     for name in (*p.description.time.column, *p.description.channels):
@@ -58,7 +73,7 @@ def propose_roles(p: Proposal) -> None:
     propose_clock(p)
     propose_part(p)
     propose_label(p)
-    propose_channels(p, _units(p))
+    propose_channels(p, {column.name: column.unit for column in p.unused if may_be_channel(column)})
     find_lost(p)
     clock = p.description.time
     if any(UNKNOWN in about.keep for about in p.description.rows.values()):
@@ -69,25 +84,27 @@ def propose_roles(p: Proposal) -> None:
         propose_lengths(p)
     if p.description.order == "name" and UNKNOWN not in clock.column:
         propose_order(p)
-    list_others(p)
+    listings = {source.listing for source in p.description.labels}
+    others = sorted({*p.others} - listings, key=natural_key)
+    if UNKNOWN not in p.description.exclude and others:
+        p.put("exclude", others)
+    p.put("ignored", {column.name: column.unit for column in p.unused})
 
 
 def set_rows(p: Proposal, rows: Mapping[str, RowWords]) -> None:
     """Set `[rows]` in `p`, and leave the rows that are no samples out of its tables and columns.
 
-    A column of `rows` with `?` in its `keep` is left aside. A recording keeps all rows if it lacks
-    one of the others, or has a word without a meaning there. Nothing changes if `rows` is empty.
+    A recording keeps all rows if it lacks a column of `rows`, or has a word without a meaning
+    there, so if `keep` is `?`. Nothing changes if `rows` is empty.
     """
-    if not rows:
-        return
-    p.description = replace(p.description, rows=rows)
-    certain = {name: about for name, about in rows.items() if UNKNOWN not in about.keep}
-    tables = [table for table in p.tables if not is_dropped(table, certain)]
-    for i, table in enumerate(tables):
-        with suppress(DataError):
-            tables[i] = kept_rows(table, certain)
-    p.tables = tables
-    p.columns = columns_of(tables, p.description.text)
+    if rows:
+        p.description = replace(p.description, rows=rows)
+        tables = [table for table in p.tables if not is_dropped(table, rows)]
+        for i, table in enumerate(tables):
+            with suppress(DataError):
+                tables[i] = kept_rows(table, rows)
+        p.tables = tables
+        p.columns = columns_of(tables, p.description.text)
 
 
 def qualify_rows(p: Proposal) -> None:
@@ -97,17 +114,19 @@ def qualify_rows(p: Proposal) -> None:
     several, its `keep` is `?`, with a note that counts them; if it has one, that becomes its
     `keep`. If the user stated some words of a column, its other words are added to `keep`, or to
     `drop` if `keep` is stated: as `*` if they are more than 12, and not if `*` is stated. Rows that
-    are then known to be no samples are left out of `p.tables` and `p.columns`. Raises SettingError
-    for a malformed `windows.trigger`.
+    are no samples are left out of `p.tables` and `p.columns`; but none are while a `keep` is `?`,
+    nor those of a recording that lacks a column of `[rows]`. Raises SettingError for a malformed
+    `windows.trigger`.
     """
     rows = dict(p.description.rows)
     for name in rows.keys() & p.columns.keys():
         about = rows[name]
         named = {*about.keep, *about.drop, *about.invalid}
-        rest = () if ANY in named else tuple(sorted(p.columns[name].counts.keys() - named))
-        key = "drop" if about.keep else "keep"
+        rest = tuple(sorted(p.columns[name].counts.keys() - named))
         words = rest if len(rest) <= MOST_WORDS else (ANY,)
-        rows[name] = replace(about, **{key: getattr(about, key) + words})
+        if ANY not in named:
+            key = "drop" if about.keep else "keep"
+            rows[name] = replace(about, **{key: getattr(about, key) + words})
     n_rows = max(column.counts.total() for column in p.columns.values())
     for column in p.unused:
         if not qualifies(column, n_rows):
@@ -132,24 +151,24 @@ def qualifies(column: Column, n_rows: int) -> bool:
     change within a recording, or one of several must name a force or a torque. A column that is
     named like a status (`Status`, `valid`) may have numbers, and also just one word in all. Any
     other must have texts, or empty cells if it is named like a verdict, and no name like a clock. A
-    column that is named like a verdict and has one word in each recording, of which any is known to
-    mean good or bad, holds labels instead, and gives False.
+    column that is named like a verdict and has one word in all, which is known to mean good or bad,
+    holds labels instead, and gives False.
     """
-    name = column.name
     words = column.counts
-    is_named = QUALIFIER_NAME.search(name) is not None
-    is_verdict = NAME.fullmatch(name) is not None
+    is_named = QUALIFIER_NAME.search(column.name) is not None
+    is_verdict = NAME.fullmatch(column.name) is not None
     has_words = any(column.odd) or (is_verdict and column.odd)  # or beside empty cells, a number
-    is_text = has_words and not CLOCK_NAME.search(name)
-    is_signal = len(words) > 1 and any(SIGNAL.fullmatch(word) for word in words)
-    varies = not column.fixed or is_signal or (is_named and len(words) == 1)
     is_coded = is_named and any(column.odd)
     is_full = words.total() in (n_rows, len(column.fixed))  # a cell for each row, or recording
-    if not (is_named or is_text) or not varies or not is_full:
+    if not is_full or (len(words) > MOST_WORDS and not is_coded):
         return False
-    if len(words) > MOST_WORDS and not is_coded:
+    if not is_named and (not has_words or CLOCK_NAME.search(column.name)):
         return False
-    return not (is_verdict and column.fixed and has_meaning(LabelSource(column=name), words))
+    if not column.fixed:
+        return True
+    if len(words) > 1:
+        return any(map(SIGNAL.fullmatch, words))
+    return is_named and not (is_verdict and has_meaning(LabelSource(column=column.name), words))
 
 
 def propose_part(p: Proposal) -> None:
@@ -201,15 +220,15 @@ def _doubt_on(p: Proposal, name: str) -> str:
 
     The reasons: the column is named like a value that a controller aims at or like a limit
     (`F_soll`, `set_force`, `F_max`); `name` is like `x*` and stands for the columns `x0`, `x1`,
-    ..., and a step between two of their numbers differs from the first step by more than half of
-    it.
+    ..., and a step between two of their numbers is longer than 1.5 usual steps, the median.
     """
     if SET_VALUE.search(name):
         return f"{name} may be a set value"
     columns = match_numbered(name, p.tables[0].origin.get(name, ()) if p.tables else ())
     steps = np.diff([float(match[1]) for match in columns])
-    odd = np.flatnonzero(np.abs(steps - steps[:1]) > np.abs(steps[:1]) / 2)
-    return f"{name} is not numbered evenly at {columns[odd[0] + 1][0]}" if len(odd) else ""
+    if not len(steps) or steps.max() <= np.median(steps) * MOST_STEP:
+        return ""
+    return f"{name} is not numbered evenly at {columns[steps.argmax() + 1][0]}"
 
 
 def _other_scales(p: Proposal) -> Iterator[str]:
@@ -227,22 +246,14 @@ def _other_scales(p: Proposal) -> Iterator[str]:
             yield f"{name} differs, {counts}: convert them first, or state channels"
 
 
-def _units(p: Proposal) -> dict[str, str]:
-    """Return the columns that may be channels, with their units; "" for no unit.
+def may_be_channel(column: Column) -> bool:
+    """Return whether a column may be a channel, if it has no other use in the description.
 
-    Such a column has no other use in the description so far, and at least three different numbers.
-    At most 10 % of its cells are texts that do not mean a lost sample. Times, columns named like
-    counters of rows, and columns that are constant in each recording are left out. Raises
-    SettingError for a malformed `windows.trigger`.
+    It must have at least three different numbers, change within a recording, and be no times and
+    not named like a counter of rows.
     """
-    units = dict[str, str]()
-    for column in p.unused:
-        name = column.name
-        is_text = column.strange.total() > SPARSE * column.counts.total()
-        is_other = is_clock(column) or COUNTER_NAME.fullmatch(name) or column.fixed
-        if not is_text and not is_other and len(column.counts) - len(column.odd) > 2:
-            units[name] = column.unit
-    return units
+    is_other = is_clock(column) or COUNTER_NAME.fullmatch(column.name) or column.fixed
+    return not is_other and len(column.counts) - len(column.odd) > 2
 
 
 def find_lost(p: Proposal) -> None:
@@ -259,25 +270,25 @@ def find_lost(p: Proposal) -> None:
     """
     rows = dict(p.description.rows)
     for column in p.unused:
-        if column.strange and column.odd.total() <= SPARSE * column.counts.total():
+        words = {word: n for word, n in column.odd.items() if word.lower() not in LOST}
+        if words and sum(column.odd.values()) <= SPARSE * column.counts.total():
             rows[column.name] = RowWords((UNKNOWN,))
-            text = (
-                f"which rows are samples? Of numbers, and {counts_of(column.strange)}: state drop"
-            )
+            text = f"which rows are samples? Of numbers, and {counts_of(words)}: state drop"
             p.notes[f"rows.{column.name}.keep"] = text
     missing = {*p.description.text.missing}
     strange = dict[str, int]()
     for name in p.description.channels:
-        column = p.columns[name]
-        n = column.counts.total()
-        lost = column.odd.keys() - column.strange.keys()
-        if p.description.time.column and column.counts[""] > SPARSE * n:
-            lost -= {""}
-            rows.setdefault(name, RowWords((ANY,), ("",)))
-        missing |= lost
-        strange |= {word: k for word, k in column.strange.items() if k > STRANGE * n}
+        n_cells = p.columns[name].counts.total()
+        for word, n in p.columns[name].odd.items():
+            if not word and p.description.time.column and n > SPARSE * n_cells:
+                rows.setdefault(name, RowWords((ANY,), ("",)))
+            elif word.lower() in LOST:
+                missing.add(word)
+            elif n > STRANGE * n_cells and word not in missing:
+                strange[word] = n
         if p.description.format == "text":
-            strange |= {word: k for word, k in column.counts.items() if SENTINEL.fullmatch(word)}
+            counts = p.columns[name].counts.items()
+            strange |= {word: n for word, n in counts if SENTINEL.fullmatch(word)}
     set_rows(p, rows)
     p.put("text.missing", sorted(missing))
     if strange:
@@ -287,42 +298,49 @@ def find_lost(p: Proposal) -> None:
 def propose_lengths(p: Proposal) -> None:
     """Set `traces.samples` in `p` to the median length of the recordings, rounded down.
 
-    The length is that of the first channel. Recordings without rows are ignored, and without a
-    channel it is 0. If some have another length, and `traces.lengths` is not stated, a note counts
-    them; if they are more than 10 %, `traces.lengths` becomes `pad`. A stated `traces.samples`
-    stays. Another note counts the recordings that end with several zeros, if they are more than
-    10 % and the numbers of zeros differ: these may fill up shorter ones.
+    The length is that of the first channel; without one nothing is set. Recordings without rows are
+    ignored. If some have another length, and `traces.lengths` is not stated, a note counts them; if
+    they are more than 10 %, `traces.lengths` becomes `pad`. A stated `traces.samples` stays.
+    Another note counts the recordings that end with two zeros or more, if they are more than 10 %:
+    these may fill up shorter ones.
     """
-    first = [p.columns[name] for name in p.description.channels][:1]
-    lengths = [len(words) for column in first for words in column.words if len(words)]
-    usual = int(np.median(lengths or 0))
-    others = [n for n in lengths if n != usual]
-    if others:
-        text = (
-            f"{len(others)} of {len(lengths)} recordings have another length, {min(others)} to "
-            f"{max(others)}; other choices: cut, pad-all, resample, strict"
-        )
-        p.put("traces.lengths", "pad" if len(others) > SPARSE * len(lengths) else "strict", text)
-    zeros = [len(x) - len(np.trim_zeros(x, "b")) for column in first for x in column.numbers]
-    filled = [n for n in zeros if n > 1]
-    is_filled = len({*filled}) > 1 and len(filled) > SPARSE * len(zeros)
-    text = (
-        f"{len(filled)} recordings end with 2 to {max(filled, default=0)} zeros: are these samples?"
-    )
-    p.put("traces.samples", usual, text if is_filled else "")
+    for channel in [*p.description.channels][:1]:
+        column = p.columns[channel]
+        lengths = [len(words) for words in column.words if len(words)]
+        usual = int(np.median(lengths or 0))
+        others = [n for n in lengths if n != usual]
+        if others:
+            text = (
+                f"{len(others)} of {len(lengths)} recordings have another length, {min(others)} to "
+                f"{max(others)}; other choices: cut, pad-all, resample, strict"
+            )
+            is_few = len(others) <= SPARSE * len(lengths)
+            p.put("traces.lengths", "strict" if is_few else "pad", text)
+        n_filled = sum(not x[-2:].any() for x in column.numbers)
+        is_filled = n_filled > SPARSE * len(lengths)
+        note = f"{n_filled} recordings end with several zeros: are these samples?"
+        p.put("traces.samples", usual, note if is_filled else "")
 
 
-def list_others(p: Proposal) -> None:
-    """Set in `p` the columns without any use as `ignored`, and the files `p.others` as `exclude`.
+def propose_order(p: Proposal) -> None:
+    """Set `order` in `p` to `?`, with a note, if the file names, sorted, need not be the order.
 
-    `ignored` has the unit of each column (`Column.unit`), and replaces also a stated `ignored`.
-    Listings of labels are not excluded. If there is no file, if `exclude` is stated, or if it is
-    `?` because other files may be recordings, it stays. Raises SettingError for a malformed
-    `windows.trigger`.
+    That is so if a file name stands in several folders, once the text of `label.path` is left out;
+    if a file name has a date that is written with the day, the month or AM and PM so that names do
+    not sort by it, or the names are not in the order of their dates; or if a column of `p.unused`
+    has one date or time per recording, and these, as `natural_key` sorts texts, are in another
+    order. If several hold, the note is on the last. An `order` that the user stated stays. Raises
+    SettingError for a malformed `windows.trigger`.
     """
-    listings = {source.listing for source in p.description.labels}
-    others = sorted({*p.others} - listings, key=natural_key)
-    if UNKNOWN not in p.description.exclude and others:
-        p.put("exclude", others)
-    units = {column.name: column.unit for column in p.unused}
-    p.put("ignored", units)
+    paths = [without_label(p.description.label, without_suffix(name)) for name in p.names]
+    names = [path.rpartition("/")[2] for path in paths]
+    if len({*paths}) > len({*names}):
+        p.put("order", UNKNOWN, "name: by file name, or path: folder by folder")
+    matches = [*filter(None, map(DATE.search, names))]
+    dates = [match.string[match.start() :] for match in matches]
+    if any(match["odd"] for match in matches) or dates != sorted(dates, key=natural_key):
+        p.put("order", UNKNOWN, ODD)
+    for column in p.unused:
+        ranks = [*map(natural_key, column.fixed)] if column.forms else []
+        if ranks != sorted(ranks):
+            p.put("order", UNKNOWN, f"name, or {column.name}, whose dates have another order")

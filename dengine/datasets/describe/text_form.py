@@ -21,7 +21,7 @@ from ..read.files import caught, natural_key
 from ..read.text import BLANK, COMMENT, header_names, split_line, to_utf8
 from ..table import UnreadableError, pattern_of
 from ..units import is_unit
-from .columns import LEAST_RUN, NUMBER, Proposal, Stated
+from .columns import LEAST_RUN, MOST_WORDS, NUMBER, Proposal, Stated
 
 DELIMITERS = ";\t|, "
 BLANKS_LEAD = 1.15  # by which blanks must be the better delimiter, since cells may hold some
@@ -32,7 +32,6 @@ MOST_BYTES = 2_000_000  # of a file that are read
 LATIN = "cp1252"
 MOST_LINES = 200  # by which the delimiter and the first row of samples are found
 MOST_NAMES = 20  # columns without a header that get a name each
-MOST_CLASSES = 12  # whole numbers in the first column of a matrix that are its classes
 DIGITS = re.compile(r"\d+")
 WHOLE = re.compile(r"-?\d+(\.0*)?(e\+00)?")
 UNIT_WORDS = re.compile(
@@ -44,11 +43,13 @@ Rows = Sequence[Sequence[str]]
 class Look(NamedTuple):
     """The first lines of a file.
 
-    form : of the file. width : cells of a row. line : the header. rows : the cells of the samples.
+    form : of the file. width : cells of a row. is_closed : whether a delimiter ends each row.
+    line : the header. rows : the cells of the samples.
     """
 
     form: TextForm
     width: int
+    is_closed: bool
     line: str
     rows: Rows
 
@@ -72,17 +73,13 @@ def look(content: bytes, stated: Stated) -> Look:
     if not text.strip():
         raise DataError("Expected a text, got an empty file.")
     marks = stated.get("text.delimiter", DELIMITERS)
-    head = lines[:MOST_LINES]
-    share, width, delimiter = max((*_share_of_numbers(head, mark), mark) for mark in marks)
-    if share == 0:  # a single column
-        delimiter = ","
-        width = 1
+    _, width, delimiter = max(_share_of_numbers(lines[:MOST_LINES], mark) for mark in marks)
     rows = [[*map(str.strip, split_line(line, delimiter))] for line in lines]
     data = _first_row(rows[:MOST_LINES], width)
-    is_closed = not any(row[-1] for row in rows[data:] if len(row) == width)  # by a delimiter
+    is_closed = not any(row[-1] for row in rows[data:] if len(row) == width)
     header, units = _head_lines(rows[:data], width - is_closed, stated)
     form = TextForm(encoding, delimiter, header=header, units=units, data=data + 1)
-    return Look(form, width, "".join(lines[header - 1 : header]), rows[data:])
+    return Look(form, width, is_closed, "".join(lines[header - 1 : header]), rows[data:])
 
 
 def decode(content: bytes, stated: str) -> tuple[str, str]:
@@ -103,28 +100,24 @@ def decode(content: bytes, stated: str) -> tuple[str, str]:
     return encoding, text.decode()[:MOST_BYTES]
 
 
-def _share_of_numbers(lines: Sequence[str], delimiter: str) -> tuple[float, int]:
-    """Return a score of how well a delimiter splits lines into numbers, and the cells per line.
+def _share_of_numbers(lines: Sequence[str], delimiter: str) -> tuple[float, int, str]:
+    """Return a score of how well a delimiter splits lines into numbers, the cells per line, and it.
 
     The score is the share of lines with the most frequent number of cells, times the share of
     numbers among their cells that are not empty, plus 0.01; it is divided by 1.15 if the delimiter
     is a blank, since cells may have blanks in them, and rounded to two decimals, so that near
-    scores are equal. It is 0 only if the lines have fewer than 2 cells, or all cells are empty. The
-    first third of the lines, which may be text above the samples, and empty lines are left out.
+    scores are equal. If the lines have fewer than 2 cells, or all cells are empty, the result is a
+    score of 0 for a single column, with a comma as its delimiter. The first third of the lines,
+    which may be text above the samples, and empty lines are left out.
     """
     rows = [split_line(line, delimiter) for line in lines[len(lines) // 3 :] if line.strip()]
     width = mode([*map(len, rows), 0])
     same = [row for row in rows if len(row) == width]
     cells = [cell for row in same for cell in row if cell.strip()]
     if width < 2 or not cells:
-        return 0.0, width
-    share = _count_numbers(cells) / len(cells) * len(same) / len(rows) + 0.01
-    return round(share / (BLANKS_LEAD if delimiter == BLANK else 1), 2), width
-
-
-def _count_numbers(cells: Sequence[str]) -> int:
-    """Return how many cells are numbers, with any decimal mark and any mark of thousands."""
-    return sum(1 for cell in cells if NUMBER.fullmatch(cell))
+        return 0.0, 1, ","
+    share = len([*filter(NUMBER.fullmatch, cells)]) / len(cells) * len(same) / len(rows) + 0.01
+    return round(share / (BLANKS_LEAD if delimiter == BLANK else 1), 2), width, delimiter
 
 
 def _first_row(rows: Rows, width: int) -> int:
@@ -138,7 +131,7 @@ def _first_row(rows: Rows, width: int) -> int:
     `0.1,5,` (a lost sample), but not `time,force,`. If the row found is a numbering
     (`is_numbering`) and the row below it is none, it names columns, and the row below is the first.
     """
-    counts = [_count_numbers(row) if len(row) == width else 0 for row in rows]
+    counts = [len([*filter(NUMBER.fullmatch, row)]) * (len(row) == width) for row in rows]
     least = max(0.6 * float(np.median(counts[len(counts) // 3 :])), 1)
     first = next((i for i in range(len(rows)) if min(counts[i : i + 4]) >= least), 0)
     forms = [NUMBER.sub("0", row[0]) if len(row) == width else "" for row in rows]
@@ -202,7 +195,7 @@ def propose_form(p: Proposal, contents: Mapping[str, bytes], faults: list[Fault]
     forms = {name: (item.form.delimiter, item.width, item.line) for name, item in looks.items()}
     usual = mode([*forms.values(), ()])
     same = [name for name, form in forms.items() if form == usual]
-    odd = [name for name, form in forms.items() if form != usual]
+    odd = [name for name in forms if name not in same]
     p.others = [*p.others, *odd]
     p.names = [name for name in p.names if name not in odd]
     long = [name for name in odd if len(looks[name].rows) >= LEAST_RUN]
@@ -224,15 +217,14 @@ def _propose_keys(p: Proposal, looks: Sequence[Look]) -> None:
 
     looks : how each of the files, which are of one form, is written, and the cells of its samples.
     """
-    usual = looks[0]
+    usual = next((item for item in looks if item.form.encoding == LATIN), looks[0])
     form = usual.form
     above = int(form.header)
     is_moved = {item.form.header for item in looks} != {above}
     if above and (is_moved or isinstance(p.description.text.header, str)):
         units = form.units and form.units - above
         form = replace(form, header=usual.line, units=units, data=form.data - above)
-    if any(item.form.encoding == LATIN for item in looks):
-        form = replace(form, encoding=LATIN)
+    if form.encoding == LATIN:
         p.notes["text.encoding"] = f"{LATIN} reads any text: look at the letters below"
     names = () if p.stated.get("text.header") else tuple(_column_names(usual))
     for key, value in asdict(replace(form, names=names)).items():
@@ -244,25 +236,25 @@ def _propose_keys(p: Proposal, looks: Sequence[Look]) -> None:
 def _column_names(usual: Look) -> Sequence[str]:
     """Return the names for `text.names`; empty if the header names each column.
 
-    If the header has only empty cells beyond the last column, the names are those of the header; if
-    it has fewer cells than there are columns, the last ones are named `column3`, `column4`, ...
-    Without a header, or if it has more words than there are columns, the names are `c0`, `c1`, ...;
-    for 20 columns or more it is `x*`, which names all of them. Such a table may have a part in each
-    row: if its first column has 2 to 12 different words, all whole numbers, and fewer of them than
-    the second, it is named `class`, before `x*`.
+    If the header has only empty cells beyond the last column, the names are those of the header; so
+    they are if it lacks the last column and this is empty, and then that is named like `column3`.
+    Without a header, or if it has another number of words, the names are `c0`, `c1`, ...; for 20
+    columns or more it is `x*`, which names all of them. Such a table may have a part in each row:
+    if its first column has 2 to 12 different words, all whole numbers, and fewer of them than the
+    second, it is named `class`, before `x*`.
 
     usual : how a typical file is written, and the cells of its samples.
     """
     width = usual.width
-    line = COMMENT.sub("", usual.line.lstrip())
-    cells = split_line(line, usual.form.delimiter)
-    if line and not any(map(str.strip, cells[width:])):
-        names = header_names([*cells, *[""] * (width - len(cells))])[:width]
-        return names if len(cells) != width else []
+    cells = split_line(COMMENT.sub("", usual.line.lstrip()), usual.form.delimiter)
+    if len(cells) == width:
+        return []
+    if len(cells) >= width - usual.is_closed and not any(map(str.strip, cells[width:])):
+        return header_names([*cells, ""])[:width]
     if width < MOST_NAMES:
         return [f"c{i}" for i in range(width)]
     firsts, seconds = ({row[i] for row in usual.rows if len(row) > i} for i in (0, 1))
-    is_class = 1 < len(firsts) <= min(MOST_CLASSES, len(seconds) - 1)
+    is_class = 1 < len(firsts) <= min(MOST_WORDS, len(seconds) - 1)
     return ["class", "x*"] if is_class and all(map(WHOLE.fullmatch, firsts)) else ["x*"]
 
 
