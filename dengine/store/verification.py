@@ -349,10 +349,9 @@ class CellCheck:
     def _check_rows(self, table: str) -> Iterator[HistoryFault]:
         """Yield a fault for each row of a table that was changed or is not in the ledger.
 
-        A row with neither a ledger entry nor a sum is not in the ledger: something beside dengine
-        wrote it. But a row with a sum that fits and no entry, or one below 1, is not noticed. A row
-        was changed if its values do not fit its stored sum. The state of a version has a sum of its
-        own, and a fault of its own.
+        A row that names no ledger entry is not in the ledger: something beside dengine wrote it. A
+        row was changed if its values do not fit its stored sum. The state of a version has a sum of
+        its own, and a fault of its own.
 
         The sums of every row with an entry, also of a changed one, are kept for `_check_ledger`.
         Each row adds 1 to `rows`. After every 500th row (CHUNK) `on_rows` is called with 500; `run`
@@ -365,7 +364,7 @@ class CellCheck:
             key = row[KEY[table]]
             entry = row["entry"]
             stored = row["sum"]
-            if entry is None and stored is None:
+            if not isinstance(entry, int) or entry < 1:
                 yield self._fault(table, key, "is not chained: something beside dengine wrote it")
                 continue
             if row_sum(table, row) != stored:
@@ -376,8 +375,7 @@ class CellCheck:
                 and state_sum(_bytes(row["state"])) != row["state_sum"]
             ):
                 yield self._fault(table, key, "its state was changed")
-            if isinstance(entry, int):
-                self._sums[table] += ROW_SUM.pack(entry, _bytes(stored))
+            self._sums[table] += ROW_SUM.pack(entry, _bytes(stored))
 
     def _check_ledger(self) -> Iterator[HistoryFault]:
         """Yield a fault for each ledger entry that was changed or is missing; fill `digests`.

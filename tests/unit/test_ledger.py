@@ -137,6 +137,7 @@ def test_a_value_changed_in_any_column_of_any_table_is_found(written, tmp_path):
             ("event", "4"),
         ),
         ("UPDATE label SET entry = 2 WHERE seq = 3", ("label", "d2")),
+        ("UPDATE label SET entry = NULL WHERE seq = 3", ("label", "d2")),
         ("UPDATE ledger SET digest = zeroblob(32) WHERE number = 2", ("ledger", "entry 2")),
     ],
 )
