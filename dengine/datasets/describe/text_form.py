@@ -18,7 +18,7 @@ from ...errors import DataError, listed
 from ..dataset import Fault
 from ..description import UNKNOWN, TextForm
 from ..read.files import caught, natural_key
-from ..read.text import BLANK, COMMENT, header_names, split_line, to_utf8
+from ..read.text import BLANK, COMMENT, LATIN, header_names, split_line, to_utf8
 from ..table import UnreadableError, pattern_of
 from ..units import is_unit
 from .columns import LEAST_RUN, MOST_WORDS, NUMBER, Proposal, Stated
@@ -29,7 +29,6 @@ GROUPS = ("", ".", ",", "'", "’", "\u202f", "\xa0", " ")  # marks between grou
 LIKELY = 0.95  # of the numbers that the marks of a text must read; the others are damaged
 SAME_DIGITS = str.maketrans("23456789", "11111111")  # for numbers of one form
 MOST_BYTES = 2_000_000  # of a file that are read
-LATIN = "cp1252"
 MOST_LINES = 200  # by which the delimiter and the first row of samples are found
 MOST_NAMES = 20  # columns without a header that get a name each
 DIGITS = re.compile(r"\d+")

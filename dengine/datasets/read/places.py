@@ -15,7 +15,7 @@ from ..description import LabelSource, PartSource, TextForm
 from ..table import Table, UnreadableError
 from .files import natural_key, read_file
 from .frames import read_parquet
-from .text import read_text, to_utf8
+from .text import LATIN, read_text, to_utf8
 
 DELIMITERS = (",", ";", "\t", "|")
 SUFFIX = re.compile(r"\.[A-Za-z]\w{0,7}(\.gz)?$")  # of a file
@@ -115,16 +115,22 @@ def listing_table(path: Path, form: TextForm) -> Table:
 
     A name that ends in `.parquet` tells the first. The first line of a text has the names of the
     columns; the delimiter is the first of `, ; tab |` that is most frequent in it. Cells of a text
-    stay texts. Of `form` only the encoding is used. Raises UnreadableError if the file cannot be
-    read, is not in the encoding or has no rows, or a row has another number of cells; DataError for
-    a damaged Parquet file or without pyarrow; and LookupError for an encoding that Python does not
-    know.
+    stay texts. Of `form` only the encoding is used; a text that is not in it is read as cp1252.
+    Raises UnreadableError if the file cannot be read, has a zero or no rows, or a row has another
+    number of cells; DataError for a damaged Parquet file or without pyarrow; and LookupError for an
+    encoding that Python does not know.
     """
     content = read_file(path)
     if path.suffix.lower() == ".parquet":
         return read_parquet(content, path.name)
-    header = to_utf8(content, form.encoding).decode().partition("\n")[0]
-    plain = TextForm(form.encoding, max(DELIMITERS, key=header.count))
+    encoding = form.encoding
+    try:
+        text = to_utf8(content, encoding)
+    except UnreadableError:
+        encoding = LATIN
+        text = to_utf8(content, encoding)
+    header = text.decode().partition("\n")[0]
+    plain = TextForm(encoding, max(DELIMITERS, key=header.count))
     return read_text(content, path.name, plain).whole()
 
 
@@ -197,11 +203,11 @@ class LabelReader:
         """Return the label of a recording: 1 good, 0 bad, None not checked.
 
         `table` is the table of the recording, and `part` its part number. If the source is a
-        listing, the key that was found in it is added to `used`, the keys found so far.
-        Words are compared exactly; a word that is stated for several meanings is good before bad,
-        and bad before not checked. Raises UnreadableError if there is no word or several (see
-        `word`), or if it has no stated meaning, and DataError if `source.path` is no regular
-        expression with one group.
+        listing, the key that was found in it is added to `used`, the keys found so far. Words are
+        compared exactly; a word that is stated for several meanings is good before bad, and bad
+        before not checked. Raises UnreadableError if there is no word or several (see `word`), or
+        if it has no stated meaning, and DataError if `source.path` is no regular expression with
+        one group.
         """
         source = self.source
         word = self.word(table, part)
@@ -242,10 +248,9 @@ def read_labels(base: Path, source: LabelSource, form: TextForm) -> LabelReader:
     """Return the reader of a source of labels, after reading its listing, if it has one.
 
     The listing stands in the folder `base`, and is a text in the encoding of `form` or a Parquet
-    file. Raises DataError if it cannot be read, or
-    if `source.key` and `source.column`, the columns of keys and words in it, are not both stated
-    and there, and LookupError for an encoding that Python does not know. Whether `source.path` is a
-    regular expression is not checked here.
+    file. Raises DataError if it cannot be read, or if `source.key` and `source.column`, the columns
+    of keys and words in it, are not both stated and there, and LookupError for an encoding that
+    Python does not know. Whether `source.path` is a regular expression is not checked here.
     """
     listing = defaultdict[str, set[str]](set)
     if source.listing:

@@ -17,6 +17,7 @@ from ..description import TextForm
 from ..table import Table, UnreadableError
 
 COMMENT = re.compile(r"^[#%]+\s*")
+LATIN = "cp1252"  # reads nearly any text
 BLANK = " "
 REST = "*"  # at the end of the last name: it stands for all columns that remain
 
