@@ -195,6 +195,7 @@ class Run:
             git("worktree", "prune")
             git("worktree", "add", "--detach", str(self.source), self.about["checkout"])
         part = PARTS[name]
+        self.folder(name).mkdir(parents=True, exist_ok=True)
         words = part.command.format(
             out=self.folder(name),
             screw=f" --screw {screw.resolve()}" if screw else "",
