@@ -4,11 +4,9 @@ import re
 from collections import Counter
 from dataclasses import replace
 
-import numpy as np
-
 from ...errors import listed
 from ..description import ANY, UNKNOWN, Channel, TextForm
-from ..read.split import OBJECTS, split
+from ..read.split import OBJECTS, has_lists, split
 from ..table import Table
 from .clock import NAME as CLOCK_NAME
 from .columns import LEAST_RUN, Column, Proposal, Tables, columns_of
@@ -39,9 +37,7 @@ def layout_of(p: Proposal, files: Tables) -> str:
     first = files[0]
     if kind in OBJECTS and len(p.names) > 1 and len(first.lines) == 1:
         return "files"
-    cells = [cell for column in first.columns.values() for cell in column[:1]]
-    has_lists = any(isinstance(cell, list | np.ndarray) and len(cell) > 1 for cell in cells)
-    if has_lists or numbered_columns(first):
+    if has_lists(first) or numbered_columns(first):
         return "npz" if kind == "npz" else "wide"
     columns = columns_of(files, TextForm())
     runs = [column for column in columns.values() if may_tell_parts(column)]

@@ -241,9 +241,9 @@ def _other_scales(p: Proposal) -> Iterator[str]:
     sources += [PartSource(line=line) for line in lines_of(p)]
     for source in sources:
         name = " ".join(source.column) or source.line
-        counts = counts_of(part_words(source, p.tables).values())
-        if SCALE_NAME.search(name) and "," in counts:
-            yield f"{name} differs, {counts}: convert them first, or state channels"
+        words = [*part_words(source, p.tables).values()] if SCALE_NAME.search(name) else []
+        if len({*words}) > 1:
+            yield f"{name} differs, {counts_of(words)}: convert them first, or state channels"
 
 
 def may_be_channel(column: Column) -> bool:
