@@ -43,8 +43,9 @@ def load_dataset(
         store gets an event on it). A file or table of these is read by a description all the same
         if one is given, or saved beside the file.
     description : Description, dict or path, optional
-        How the recordings are written; not beside a `Dataset` or a pair. None: the description that
-        was saved, as `recordings.toml` in the folder or `FILE.toml` beside the file.
+        How the recordings are written; DataError beside a `Dataset`, a pair or the name of a
+        bundled set. None: the description that was
+        saved, as `recordings.toml` in the folder or `FILE.toml` beside the file.
     channels : str or sequence of str, optional
         The channels to read, "FZ_Base" or "FZ_Base,FX_Base", among those that the description or
         the data set names. None: all channels.
@@ -68,7 +69,8 @@ def load_dataset(
         type), if the source or a channel does not exist, if no recording is left, if `samples` is
         below 1, or if the traces are shorter than `samples`, or longer although they were
         resampled. Also if none of the files can be read, a listing of labels cannot, or the traces
-        and labels do not fit together (`make_dataset`).
+        and labels do not fit together (`make_dataset`), as those of a table of `Dataset.to_frame`
+        that was changed.
     SettingError
         If `windows.trigger` of the description, which cuts long recordings, is malformed.
     ValueError
@@ -173,8 +175,8 @@ def own_reader(source: Any) -> Callable[[], Dataset] | None:
     of 1 and 0, and a SQLite file, which must be a store. The function takes no arguments and raises
     the errors of `load_dataset`. A folder needs a description, and so does a file beside which one
     was saved, whatever it holds. Raises DataError for a source of an unknown type, for a path that
-    does not exist, for a file that cannot be opened, for a damaged .npz or Parquet file, and for a
-    Parquet file without pyarrow.
+    does not exist, for a file that cannot be opened, for a damaged .npz or Parquet file, for an
+    .npz file whose y holds Python objects, and for a Parquet file without pyarrow.
     """
     if isinstance(source, Dataset):
         return lambda: source
@@ -232,14 +234,14 @@ def _read_own_table(path: Path) -> Dataset:
     return _from_own_frame(pd.read_parquet(path), path.stem)
 
 
+@instead(DataError, "Expected a table as Dataset.to_frame made it", KeyError, TypeError, ValueError)
 def _from_own_frame(frame: Any, name: str = "table") -> Dataset:
     """Return the data set of a DataFrame that `Dataset.to_frame` made; `name` becomes its name.
 
     All columns but label, part and cause are samples; each channel gets an equal share of them, in
-    order. Raises DataError if `make_dataset` refuses its arrays, KeyError if it has no longer a
-    column `label`, and ValueError if columns of samples are no numbers or their number is no
-    multiple of the number of channels in `attrs`. Other columns that were added or removed are not
-    noticed.
+    order. Raises DataError if `make_dataset` refuses its arrays, if it has no row or no longer a
+    column `label`, if columns of samples are no numbers, or if their number is no multiple of the
+    number of channels in `attrs`. Other columns that were added or removed are not noticed.
     """
     about = {**frame.attrs[OWN]}
     words = frame[frame.columns.intersection(["part", "cause"])].astype(str)

@@ -66,10 +66,11 @@ def columns_of(prefix: str, value: Any) -> Columns:
     """Return a value of JSON or NumPy as columns by name; a scalar becomes a column with one cell.
 
     A list of scalars becomes one column, a mapping has a column for each key, and a list of
-    mappings for each key of the first of them. An array or list of lists (C, n) with C <= n, or
-    (n, C) with C < n, has a column for each of its C channels. Nested values are treated in the
-    same way; an empty list is a column without cells, an empty mapping none. Raises UnreadableError
-    if the items of a list whose first item is a list or mapping are not all alike.
+    mappings for each key of the first of them (or, if they are curves with names, for each name and
+    key, see `_turned`). An array or list of lists (C, n) with C <= n, or (n, C) with C < n, has a
+    column for each of its C channels. Nested values are treated in the same way; an empty list is a
+    column without cells, an empty mapping none. Raises UnreadableError if the items of a list whose
+    first item is a list or mapping are not all alike.
 
     prefix : the name of the value; a dot and the key, or the channel from 0, are appended. Without
     a name, "", a column is called by the key alone.
@@ -88,7 +89,7 @@ def columns_of(prefix: str, value: Any) -> Columns:
 
 
 def _turned(value: Any) -> Mapping[Any, Any] | None:
-    """Return a list of mappings as a list for each key, or a list of lists as one for each channel.
+    """Return a list of mappings as one mapping of lists by key, a list of lists as one by channel.
 
     Mappings that hold lists, like `{"name": "force", "data": [...]}`, become one for each name, if
     the texts under some key are all different; the first such key counts.
@@ -118,8 +119,8 @@ def _turned(value: Any) -> Mapping[Any, Any] | None:
 def as_cells(values: Any) -> Cells:
     """Return values as an array (n,): of numbers if all are int or float, otherwise of objects.
 
-    An array is returned as it is. True and False count as objects; without values the array is of
-    floats.
+    An array is returned as it is. True, False and numbers of NumPy's own types count as objects;
+    without values the array is of floats.
     """
     if isinstance(values, np.ndarray) or {*map(type, values)} <= {int, float}:
         return np.asarray(values)

@@ -87,8 +87,9 @@ def words_of(
     If the source states a path or a line above the header, that gives one word; otherwise each of
     `columns` of the recording's table gives one, "" for an empty cell: that of all rows if `at` is
     "same", or of the "first" or "last" row. Raises UnreadableError if a column, the line or a match
-    of the path is missing, if a column has lists or no rows, or if rows differ under "same", and
-    DataError if the path is no regular expression with one group.
+    of the path is missing, if a column has lists or no rows, or if rows differ under "same" or the
+    words of several such lines do, and DataError if the path is no regular expression with one
+    group.
     """
     if source.path:
         return [path_word(table.path, source.path)]
@@ -101,8 +102,9 @@ def part_of(source: PartSource, table: Table) -> str:
     """Return the part number of a recording by `[part]`, `source`; "" if that states nothing.
 
     The words of several columns are joined by blanks. Raises UnreadableError if the stated column,
-    line or match is missing, or it or any of several columns is empty, or if the number changes
-    within the recording, and DataError if the stated path is no regular expression with one group.
+    line or match is missing, or it or any of several columns is empty, or if the rows or such lines
+    of the recording have different numbers, or a column has lists or no rows, and DataError if the
+    stated path is no regular expression with one group.
     """
     words = words_of(source, table, source.column)
     if not all(words):
@@ -116,9 +118,9 @@ def listing_table(path: Path, form: TextForm) -> Table:
     A name that ends in `.parquet` tells the first. The first line of a text has the names of the
     columns; the delimiter is the first of `, ; tab |` that is most frequent in it. Cells of a text
     stay texts. Of `form` only the encoding is used; a text that is not in it is read as cp1252.
-    Raises UnreadableError if the file cannot be read, has a zero or no rows, or a row has another
-    number of cells; DataError for a damaged Parquet file or without pyarrow; and LookupError for an
-    encoding that Python does not know.
+    Raises UnreadableError if the file cannot be read, has a zero byte or no rows, or a row has
+    another number of cells; DataError for a damaged Parquet file or without pyarrow; and
+    LookupError for an encoding that Python does not know.
     """
     content = read_file(path)
     if path.suffix.lower() == ".parquet":
@@ -163,14 +165,16 @@ class LabelReader:
         """Return the word that stands for the label of a recording, like "ok".
 
         `table` is the table of the recording, and `part` its part number. If the source is a
-        listing, it is the word of all its rows with the key of the recording. The key is the
-        first of these that is listed: the number of the part, the path, the file name, the path
-        without suffix, the file name without suffix. It is added to `used`, the keys found so far.
+        listing, it is the word of all its rows with the key of the recording. The key is the first
+        of these that is listed: the number of the part, the path, the file name, the path without
+        suffix, the file name without suffix; they are compared as `as_key` writes them, so 0012 is
+        12. A word is "" if its cell is empty. The key is added to `used`, the keys found so far.
 
         Raises
         ------
         UnreadableError
-            If there is no word for the recording, if rows of the listing have different ones, or if
+            If the column, line, match or key is missing, if a column has lists or no rows,
+            if rows of the listing have different ones, or if
             the recording's own rows have and `source.at` is "same". If the key, a file's name, was
             found for another path before.
         DataError
@@ -206,8 +210,8 @@ class LabelReader:
         listing, the key that was found in it is added to `used`, the keys found so far. Words are
         compared exactly; a word that is stated for several meanings is good before bad, and bad
         before not checked. Raises UnreadableError if there is no word or several (see `word`), or
-        if it has no stated meaning, and DataError if `source.path` is no regular expression with
-        one group.
+        if it has no stated meaning (an empty word, too), and DataError if `source.path` is no
+        regular expression with one group.
         """
         source = self.source
         word = self.word(table, part)
@@ -222,7 +226,7 @@ class LabelReader:
     def unused_note(self) -> str:
         """Return a sentence on rows of the listing that name no recording, "" if there is none.
 
-        It has the keys of up to eight of them, with the number of all.
+        It has the keys of up to eight of them. It counts keys, so rows with one key count once.
         """
         unused = sorted(self.listing.keys() - self.used.keys(), key=natural_key)
         if not unused:
