@@ -44,8 +44,8 @@ def load_dataset(
         if one is given, or saved beside the file.
     description : Description, dict or path, optional
         How the recordings are written; DataError beside a `Dataset`, a pair or the name of a
-        bundled set. None: the description that was
-        saved, as `recordings.toml` in the folder or `FILE.toml` beside the file.
+        bundled set. None: the description that was saved, as `recordings.toml` in the folder or
+        `FILE.toml` beside the file.
     channels : str or sequence of str, optional
         The channels to read, "FZ_Base" or "FZ_Base,FX_Base", among those that the description or
         the data set names. None: all channels.
