@@ -140,8 +140,8 @@ def _survey_parts(dataset: "Dataset", survey: "Survey") -> Iterator[Any]:
 
     These are the survey's counts with the first and last trace, the notes of the data set, a
     sentence if the order of recording is unknown, one if more than 25 of the newest usable traces
-    nearly repeat another, and a warning if the tolerance of the default policy is too wide for
-    these parts, else "". The data set must have a trace.
+    nearly repeat another, and a warning if the tolerance of the default policy is too wide
+    (accepting every part of the data set would meet it), else "". The data set must have a trace.
     """
     from ..datasets.checks import tolerance_note
     from ..decision.policy import Policy

@@ -322,7 +322,7 @@ class Description:
         `?`, but a section may not. A channel named `?` is left out, and so is this name in `[rows]`
         and `[ignored]`. Of a channel, a text in place of a dict is its unit. A single value may
         stand for a list of one, and a number or boolean for a text. `notes` are no key; the result
-        has none. Raises DataError for an unknown key (the message names the most similar
+        has none. Raises DataError for an unknown key or choice (the message names the most similar
         key, or else all), for a value of the wrong type, and for a description of a newer version
         or one that is no integer.
 
@@ -346,8 +346,8 @@ class Description:
     def load(cls, path: FilePath) -> "Description":
         """Read a description from a TOML file.
 
-        Raises DataError if the file cannot be read, has more than 1 MB or is no TOML, for an
-        unknown key or a value of the wrong type, and for a description of a newer version.
+        Raises DataError if the file cannot be read, has more than 1 MB or is no TOML, and
+        where `from_dict` does. Comments are not read; the result has no `notes`.
         """
         with instead(
             DataError, f"Expected a description in {path}", OSError, ValueError, TypeError
@@ -439,11 +439,11 @@ class Description:
 
         Of the keys `column`, `path`, `line`, `topic` and `listing` in `[label]`, stating one clears
         the others, and likewise of `column`, `path` and `line` in `[part]`; words for good and bad
-        stay. Stating a channel replaces the channel `?`. In `rows.NAME.keep` and keys like it
-        (`OF_COLUMN`) the name of a column may have dots; any other key is split at its first dot.
-        A key without a dot may be a whole section, which its value then replaces. The notes stay.
-        Raises DataError for an unknown key, for a value of the wrong type, and if what stands
-        before the dot in a key is no section.
+        stay. Stating a channel replaces the channel `?`. In `rows.NAME.keep`, `channels.NAME.unit`
+        and keys like these (`OF_COLUMN`) the name of a column may have dots; any other key is split
+        at its first dot. A key without a dot may be a whole section, which its value then replaces.
+        The notes stay. Raises DataError where `from_dict` does, and if what stands before the dot
+        in a key is no section.
         """
         values = self.to_dict()
         for section in ("label", "part"):

@@ -20,7 +20,8 @@ def write_sample(folder: FilePath, n: int = 200) -> None:
     file has 960 to 1000 rows at 500 Hz, with the time in Timestamp, the force in FZ_Base, the
     height in TCP_Z, which is only noise, and the label in its name: True is good. Times are in
     seconds; file 1 begins at 1012, and each file 12 s after the one before. File 44, or the last
-    one of fewer, lacks its last 16 characters.
+    one of fewer, lacks its last 16 characters. Numbers have 7 digits; so from file 750 on, at
+    10000 s, times are rounded to 0.01 s and repeat.
 
     Parameters
     ----------

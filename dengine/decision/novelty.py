@@ -256,11 +256,11 @@ def _noise_floor(gate: NoveltyGate, x: Tensor) -> Tensor:
     """Return what is added to each roughness before its logarithm, float32 (C, 2*S + 3).
 
     `gate` says how many samples each of the 2*S + 3 roughnesses of a channel is taken over (they
-    are norms of differences in a stretch of samples, see `plain_features`). The result is a
-    twentieth of the roughness of a whole trace (the norm of its first differences in the channel,
-    as the median over the traces x (n, C, T)), times the root of the share of samples in the
-    stretch, and at least 1e-12, as for a channel that is constant in half of the traces or more:
-    any movement there is then far away.
+    are norms of differences in a stretch of samples; S is the number of segments of a channel, see
+    `plain_features`). The result is a twentieth of the roughness of a whole trace (the norm of its
+    first differences in the channel, as the median over the traces x (n, C, T)), times the root of
+    the share of samples in the stretch, and at least 1e-12, as for a channel that is constant in
+    half of the traces or more: any movement there is then far away.
     """
     n_samples = x.size(2)
     steps = torch.zeros(x.size(1))

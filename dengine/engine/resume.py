@@ -148,10 +148,11 @@ def add_labels_since(
     with a rollback, so that an engine that opens a store counts what it counted before. At most the
     `capacity` newest of each of the two kinds are read. Corrections that came since the version was
     stored are applied between the labels, in the order in which they came, so that the model is the
-    same bit for bit. A baseline (a model that the user handed in), which cannot be corrected, gets
-    the labels as they count now. A label that the model cannot take is logged and skipped; one
-    whose trace is damaged is skipped, and an event is written to the store. Returns the number of
-    the newest correction in the store. Raises StoreError if the store cannot be read.
+    same bit for bit. A correction that the model cannot take (`apply_correction` returns False) is
+    skipped without a message. A baseline (a model that the user handed in), which cannot be
+    corrected, gets the labels as they count now. A label that the model cannot take is logged and
+    skipped; one whose trace is damaged is skipped, and an event is written to the store. Returns
+    the number of the newest correction in the store. Raises StoreError if the store cannot be read.
     """
     corrected_to = int(version.state.get("corrected_to", 0))
     # A baseline cannot be corrected afterwards, so it gets each label as it counts now; another

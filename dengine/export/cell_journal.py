@@ -238,11 +238,12 @@ def import_journal(store: "StoreLike", path: FilePath, any_model: bool = False) 
     A part that was imported before is not imported again, but its label is, if it has none yet; a
     label that contradicts the stored one is only counted. A part whose trace has a fault is
     quarantined. New rows have the time of the import. The decision rule and the certificate count
-    imported parts like the engine's own. Under `stops="all"` an accepted part without a report is
-    imported as good, unless it is the journal's last part; under "some" it is imported without a
-    label. Other parts without a label are left out. If a line is missing or was changed,
-    only the lines before it are imported. A store that was passed open stays open; on PostgreSQL it
-    owns the cell until it is closed.
+    imported parts like the engine's own. Propensities and `stops` are those of the policy that the
+    store has now. Under `stops="all"` an accepted part without a report is imported as good, unless
+    it is the journal's last part; under "some" it is imported without a label. Other parts without
+    a label are left out. If a line is missing or was changed, only the lines before it are
+    imported. A store that was passed open stays open; on PostgreSQL it owns the cell until it is
+    closed.
 
     Parameters
     ----------

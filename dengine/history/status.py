@@ -733,7 +733,12 @@ def iterate_decisions(
     Yields
     ------
     StoredDecision
-        Without its trace.
+        With its corrected label, without its trace.
+
+    Raises
+    ------
+    StoreError
+        For a stored value that cannot be read.
     """
     while page := store.decisions.select(where, page_size, start_after, newest_first):
         if newest_first:

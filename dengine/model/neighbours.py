@@ -817,11 +817,12 @@ class ModelPrediction(EngineModel):
 
         The references must be finite, and the points to which the reducer maps `examples`, some
         training traces, must not be NaN. A reducer that is restored from the state of this one must
-        map `examples` to the same points within 1e-5 (`is_close`), twice in a row; if a reducer
-        gives no state, it must do so itself. The points, divided by the scale of their embedding
-        space, are kept for `check_answers`, unless a reference is not finite. If restoring raises a
-        StoreError, that is a defect; other errors are raised. Call it right after a training: a
-        restored model has no `examples`, and some reducers raise TraceError then.
+        map `examples` to the same points, twice in a row; each coordinate may differ by 1e-5 times
+        (1 + its absolute value). If a reducer gives no state, it must do so itself. The points,
+        divided by the scale of their embedding space, are kept for `check_answers`, unless a
+        reference is not finite. If restoring raises a StoreError, that is a defect; other errors
+        are raised. Call it right after a training: a restored model has no `examples`, and some
+        reducers raise TraceError then.
         """
         if not np.isfinite(self.index.column("points")).all():
             return "the embedding of a reference is not finite"

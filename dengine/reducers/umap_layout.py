@@ -332,8 +332,8 @@ def optimize_layout(
     """Move points to where attraction and repulsion are in balance.
 
     Each point has at most 16 negative samples in an epoch, random points that push it away. Their
-    mean push is weighed by 5 times the sum of the strengths of the point's edges, relative to the
-    strongest edge.
+    mean push is multiplied by 5 times the sum of the strengths of the point's edges. The strength
+    of an edge is its weight in `graph`, divided by the largest weight.
 
     Parameters
     ----------

@@ -148,8 +148,8 @@ def read_query(request: Request, struct_type: type[T], **body: bytes) -> T:
 
     If the body is bytes, `body` has these bytes under the name of the field that gets them. Texts
     are converted to the types of the fields, like "1" or "true" to True. Raises HTTPException 422
-    for an unknown name, a name that comes twice (also once in the query and once in the path or in
-    `body`), a missing field and a wrong value.
+    for an unknown name (if `struct_type` forbids unknown fields), a name that comes twice (also
+    once in the query and once in the path or in `body`), a missing field and a wrong value.
     """
     pairs = [*request.query_params.multi_items(), *request.path_params.items(), *body.items()]
     try:
@@ -536,10 +536,10 @@ class Operation:
     def describe(self, schemas: Json) -> Json:
         """Return the operation as an OpenAPI operation object, a dict.
 
-        It has the summary, the responses (200, and any other status as a problem), and for a POST
-        the request's body. The fields are parameters of a GET, and of a POST whose body may be
-        bytes; only those in the path are marked as required. `schemas` has the JSON schema of every
-        request type and response by name.
+        It has the summary, the responses (200, and for any other status a problem, the JSON object
+        that tells an error), and for a POST the request's body. The fields are parameters of a GET,
+        and of a POST whose body may be bytes; only those in the path are marked as required.
+        `schemas` has the JSON schema of every request type and response by name.
         """
         request_schema = schemas[self.request_type.__name__]
         if self.response in RESPONSES:

@@ -324,7 +324,7 @@ class HttpApi:
         """Return how the cell is doing: counts of decisions, version, faults, queue and alarm.
 
         The counts are of all decisions, and of the newest 500. 422: the stored recipe cannot be
-        read; 503: the queue is full, or the store cannot be read.
+        read; 503: the queue is full, the server is closing, or the store cannot be read.
         """
         status = await self.service.status(watch)
         line = {name: getattr(self.service, name) for name in api.LINE}

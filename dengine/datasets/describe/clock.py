@@ -60,9 +60,9 @@ def propose_clock(p: Proposal) -> None:
     one may and others a part of it, like a date or whole seconds that are the same in all rows of a
     recording; these are not looked for beside a clock whose cells tell the day. It is `?`, too, if
     no column may, but the columns have no names, or one is named `s`, which may be seconds or the
-    tool's position. Otherwise, if no column may, it stays empty. Stated columns are kept; only
-    their forms are found. Of a column that is set `time.format` may be `?` (`form_of`). Raises
-    SettingError for a malformed `windows.trigger`.
+    tool's position, or one may count the samples (`is_counter`). Otherwise, if no column may, it
+    stays empty. Stated columns are kept; only their forms are found. Of a column that is set
+    `time.format` may be `?` (`form_of`). Raises SettingError for a malformed `windows.trigger`.
     """
     clocks = [*filter(is_clock, p.unused)]
     if is_stated := "time.column" in p.stated:

@@ -73,7 +73,7 @@ def may_tell_parts(column: Column) -> bool:
     A run is one word in successive rows. The runs must have 8 rows or more on average, and each
     word one run; if the column is named like a part's number (`part`, `serial`, `id`, ...), one run
     in each table. False if a cell is empty, if no table has more than one word, and for any other
-    column that holds times or is named like them.
+    column that holds times or is named like them. Raises UnreadableError if cells are lists.
     """
     if not has_long_runs(column):
         return False
@@ -97,9 +97,11 @@ def parts_of(p: Proposal, files: Tables) -> list[Table]:
 
     `files` has the table of each file that is looked at, at least one. In the layout `long` a file
     holds several parts, one below the other; if any file was read only in part, the last of several
-    parts of each file is left out, since it may be cut. In `columns` a column that is named like a
-    clock is no part. Nothing is set in `p`. Raises DataError if a file of the layout `long` does
-    not have the columns in `part.column`, or none is stated.
+    parts of each file is left out, since it may be cut. In `columns` each column is a part that
+    fits the first stated channel, if there is one. But those in `[rows]`, and those that are named
+    like a clock in the first file, are no parts; a stated `time.column` is not used. Nothing is set
+    in `p`. Raises DataError if a file of the layout `long` does not have the columns in
+    `part.column`, if none is stated, or if their cells are lists.
     """
     description, layout = p.description, p.description.layout
     patterns = [ANY] if layout == "columns" else numbered_columns(files[0])

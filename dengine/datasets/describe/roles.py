@@ -63,8 +63,8 @@ def propose_roles(p: Proposal) -> None:
     stay, but a stated `ignored` is replaced, and a stated `[rows]` gets further columns and words
     (`qualify_rows`, `find_lost`). `p.columns` is set, and `p.tables` loses rows that are no
     samples. Raises DataError if a stated column of times or channel does not exist, a setting in
-    `[time]` is wrong, or a stated source of labels has no words or cannot be read, and SettingError
-    for a malformed `windows.trigger`.
+    `[time]` is wrong, a stated source of labels has no words or cannot be read, or cells are lists,
+    and SettingError for a malformed `windows.trigger`.
     """
     p.columns = columns_of(p.tables, p.description.text)
     for name in (*p.description.time.column, *p.description.channels):
@@ -95,7 +95,8 @@ def set_rows(p: Proposal, rows: Mapping[str, RowWords]) -> None:
     """Set `[rows]` in `p`, and leave the rows that are no samples out of its tables and columns.
 
     A recording keeps all rows if it lacks a column of `rows`, or has a word without a meaning
-    there, so if `keep` is `?`. Nothing changes if `rows` is empty.
+    there; all of them do while a `keep` is `?`. But a recording with one cell in such a column is
+    left out as a whole if the word of this cell drops it. Nothing changes if `rows` is empty.
     """
     if rows:
         p.description = replace(p.description, rows=rows)
@@ -115,8 +116,8 @@ def qualify_rows(p: Proposal) -> None:
     `keep`. If the user stated some words of a column, its other words are added to `keep`, or to
     `drop` if `keep` is stated: as `*` if they are more than 12, and not if `*` is stated. Rows that
     are no samples are left out of `p.tables` and `p.columns`; but none are while a `keep` is `?`,
-    nor those of a recording that lacks a column of `[rows]`. Raises SettingError for a malformed
-    `windows.trigger`.
+    nor those of a recording that lacks a column of `[rows]`. Raises UnreadableError if cells are
+    lists, and SettingError for a malformed `windows.trigger`.
     """
     rows = dict(p.description.rows)
     for name in rows.keys() & p.columns.keys():
@@ -176,8 +177,8 @@ def propose_part(p: Proposal) -> None:
 
     Its name must be like that of a part's number, and the different words in it must be more than
     half as many as `p.tables`. Columns that have a role are left out, and the lines are those of
-    the first table. If none qualifies, or several do, nothing is set. A stated `[part]` stays.
-    Raises SettingError for a malformed `windows.trigger`.
+    the first table. If none qualifies, or several do, nothing is set. A `[part]` that is set
+    already stays. Raises SettingError for a malformed `windows.trigger`.
     """
     sources = [PartSource((c.name,)) for c in p.unused if PART_NAME.search(c.name)]
     sources += [PartSource(line=line) for line in filter(PART_LINE.search, lines_of(p))]
@@ -193,8 +194,9 @@ def propose_channels(p: Proposal, units: Mapping[str, str]) -> None:
     The rules are tried in order, and the first that any column fits decides: a name like a force
     along z, a name like a force, a unit of force or torque, a name like `F` or `value`, any column.
     A name decides only if the unit is that of a force or torque, or unknown. If several columns fit
-    the rule, none is there, or `_doubt_on` has a reason against it, the channels stay empty, with a
-    note.
+    the rule, none is there, only other columns have a unit of force or torque, `_doubt_on` has a
+    reason against it, or `_other_scales` yields a text, the channels stay empty, with a note.
+    Raises SettingError for a malformed `windows.trigger`.
 
     units : the columns that may be channels, with their units, "" for unknown.
     """
@@ -234,8 +236,10 @@ def _doubt_on(p: Proposal, name: str) -> str:
 def _other_scales(p: Proposal) -> Iterator[str]:
     """Yield a text for each column or line above the header by which scales of recordings differ.
 
-    It is named like a unit, a factor or a rate, and has one word in each recording, but not the
-    same in all. Raises SettingError for a malformed `windows.trigger`.
+    It is named like a unit, a factor or a rate, and its word is not the same in all recordings.
+    Recordings in which it is missing, empty or changes are ignored. The columns are those without a
+    role, and the lines are those of the first table. Raises SettingError for a malformed
+    `windows.trigger`.
     """
     sources = [PartSource((column.name,)) for column in p.unused]
     sources += [PartSource(line=line) for line in lines_of(p)]
@@ -259,14 +263,15 @@ def may_be_channel(column: Column) -> bool:
 def find_lost(p: Proposal) -> None:
     """Set `text.missing` in `p` to the words that stand for lost samples (cells without a value).
 
-    They are those already there, and those of `LOST`, also the empty cell, that a channel has, in
-    any case of letters. If another text is in more than 1 % of a channel's cells, or, in a text
-    file, a number like -9999 or 1e30 in any, `text.missing` is `?`, with a note. If more than 10 %
-    of the cells of a channel are empty, "" is not added for it if `time.column` is set, even to
-    `?`: these rows belong to another signal. `[rows]` then drops them, unless it has words of this
-    channel already; its `keep` is `?` for an ignored column of numbers in which up to 10 % of the
-    cells are other words, like `Max` in a footer. Dropped rows are left out of `p.tables` and
-    `p.columns`. A stated `text.missing` stays, but `[rows]` changes all the same.
+    They are those already there, and those of `LOST`, like `nan`, `-` or the empty cell, that a
+    channel has, in any case of letters. If another text is in more than 1 % of a channel's cells,
+    or, in a text file, a number like -9999 or 1e30 in any, `text.missing` is `?`, with a note. If
+    more than 10 % of the cells of a channel are empty, "" is not added for it if `time.column` is
+    set, even to `?`: these rows belong to another signal. `[rows]` then drops them, unless it has
+    words of this channel already. It also gets each column without a role that has numbers and, in
+    up to 10 % of its cells, other words, like `Max` in a footer; `keep` is `?` there, with a note.
+    Dropped rows are left out of `p.tables` and `p.columns`. A stated `text.missing` stays, but
+    `[rows]` changes all the same. Raises SettingError for a malformed `windows.trigger`.
     """
     rows = dict(p.description.rows)
     for column in p.unused:
@@ -299,10 +304,10 @@ def propose_lengths(p: Proposal) -> None:
     """Set `traces.samples` in `p` to the median length of the recordings, rounded down.
 
     The length is that of the first channel; without one nothing is set. Recordings without rows are
-    ignored. If some have another length, and `traces.lengths` is not stated, a note counts them; if
-    they are more than 10 %, `traces.lengths` becomes `pad`. A stated `traces.samples` stays.
-    Another note counts the recordings that end with two zeros or more, if they are more than 10 %:
-    these may fill up shorter ones.
+    ignored; if all are, the length is 0. If some have another length, and `traces.lengths` is not
+    stated, a note counts them; if they are more than 10 %, `traces.lengths` becomes `pad`. A stated
+    `traces.samples` stays. Unless it is stated, another note counts the recordings that end with
+    two zeros or more, if they are more than 10 %: these may fill up shorter ones.
     """
     for channel in [*p.description.channels][:1]:
         column = p.columns[channel]

@@ -59,10 +59,10 @@ def look(content: bytes, stated: Stated) -> Look:
     The result has the text form, the number of columns, the line of the header ("" for none) and
     the cells of each line from the first row of samples on, also of lines of another form. The
     delimiter and the first row follow from the first 200 lines; of delimiters with equal scores the
-    one with more cells is taken. If none splits the usual line into cells, there is a
-    single column, and the delimiter is a comma. The marks in numbers stay those of `TextForm`.
-    `content` has the bytes of the file. Raises DataError if it is empty or no text, or if the line
-    of its header is not certain, and LookupError for a stated encoding that Python does not know.
+    one with more cells is taken. If none splits the usual line into cells, there is a single
+    column, and the delimiter is a comma. The marks in numbers stay those of `TextForm`. `content`
+    has the bytes of the file. Raises DataError if it is empty or no text, or if the line of its
+    header is not certain, and LookupError for a stated encoding that Python does not know.
 
     stated : keys that the user gave. `text.encoding` and `text.delimiter` are taken; `text.header`
     only says that a doubt about the header is no error.
@@ -85,7 +85,7 @@ def decode(content: bytes, stated: str) -> tuple[str, str]:
     """Return the encoding of a text, and its first 2 million characters, with plain line feeds.
 
     The `stated` encoding is used unless it is "". Otherwise it is UTF-16 if the text begins with
-    its byte order mark, else UTF-8, or cp1252 if UTF-8 fails. A byte order mark is left out. Raises
+    its byte order mark, else UTF-8, or cp1252 if this fails. A byte order mark is left out. Raises
     UnreadableError if the text is in none of them or contains a zero character, and LookupError for
     a stated encoding that Python does not know.
     """
@@ -152,11 +152,11 @@ def is_numbering(cells: Sequence[str]) -> bool:
 def _head_lines(rows: Rows, width: int, stated: Stated) -> tuple[int, int]:
     """Return the lines, from 1, of the header and of the units above the samples; 0 for none.
 
-    The header is the last line with at least `width` cells, the number of columns. But if more than
-    half of its words are units, and an earlier line is as wide, it is the line of the units, and
-    the earlier one is the header. If the header has a unit among its names, or a name twice, and
-    the wide line before it has no empty cell, the line before may be the header instead. DataError
-    is raised then, unless the user stated the header in `stated`, which is not looked up here.
+    The header is the last line with a word and at least `width` cells, the number of columns. But
+    if more than half of its words are units, and an earlier line is as wide, it is the line of the
+    units, and the earlier one is the header. If the header has a unit among its names, or a name
+    twice, and the wide line before it has no empty cell, the line before may be the header instead.
+    DataError is raised then, unless `stated` has the key `text.header`; its value is not used here.
 
     rows : the cells of the lines above the samples.
     """
@@ -180,10 +180,11 @@ def propose_form(p: Proposal, contents: Mapping[str, bytes], faults: list[Fault]
 
     Files with another delimiter, number of columns or header are left out: they move from `p.names`
     to `p.others`. If two or more of them have at least 8 rows of samples, or one whose name differs
-    from that of another file by a number only, `exclude` is set to `?`, with a note that asks
-    whether they are recordings. For a file that is no text, or whose header
-    is not certain, a fault is appended to `faults`, and it stays in `p.names`; if all are such,
-    nothing is set and returned. Of equally frequent forms the first counts. Stated keys stay.
+    from that of a file of the form in `[text]` by a number only, `exclude` is set to `?`, with a
+    note that asks whether they are recordings. For a file that is no text, or whose header is not
+    certain, a fault is appended to `faults`, and it stays in `p.names`; if all are such, nothing is
+    set and returned. Of equally frequent forms the first counts. Stated keys stay. Raises
+    LookupError for a stated encoding that Python does not know.
 
     contents : the contents of the files that are looked at, by name.
     """
@@ -211,8 +212,9 @@ def _propose_keys(p: Proposal, looks: Sequence[Look]) -> None:
 
     If the header stands at different lines, or the user stated a text for it, `text.header` becomes
     its text, and `text.units` and `text.data` are counted from it. If any file is read as cp1252,
-    that is the encoding, with a note that it is guessed. `_column_names` gives the names; a stated
-    header other than 0 needs none. `propose_marks` sets the marks in numbers. Stated keys stay.
+    the first such file counts instead, and a note says that the encoding is guessed.
+    `_column_names` gives the names; a stated header other than 0 needs none. `propose_marks` sets
+    the marks in numbers. Stated keys stay.
 
     looks : how each of the files, which are of one form, is written, and the cells of its samples.
     """

@@ -122,8 +122,8 @@ def samples_of(table: Table, column: str, channel: Channel, form: TextForm) -> F
     The cells of `column` are in the unit that the file states for it, or else in the unit in its
     name, or else in the channel's unit. `form` says how numbers are written. A lost sample is NaN.
     Raises UnreadableError if the file and the channel state different units, and these are of
-    different quantities or one is unknown; if the column is missing; or if a cell is no number. A
-    unit of another quantity in the name is ignored.
+    different quantities or one is unknown; if the column is missing; or if a cell is no number, is
+    infinite or is too large for float32. A unit of another quantity in the name is ignored.
     """
     values = table.numbers(column, form)
     unit = table.units.get(column)
@@ -144,9 +144,10 @@ def label_of(labels: Sequence[LabelReader], table: Table, part: str) -> int | No
     `labels` has a reader for the source of labels, and for each source that must agree with it;
     `table` and `part` are the table and the number of the part. A reader of a listing adds the key
     that it found to its `used`. Raises UnreadableError if a source has no label for the part, a
-    word without a stated meaning or contradictory rows, or if the sources do not agree, also if
-    only one of them says that it was not checked, and DataError if the path of a source is no
-    regular expression with one group.
+    word without a stated meaning or contradictory rows, if a listing names the part by its file and
+    another file had this key before, or if the sources do not agree, also if only one of them says
+    that it was not checked. Raises DataError if the path of a source is no regular expression with
+    one group.
     """
     found = [reader.label(table, part) for reader in labels]
     for i, label in enumerate(found):
@@ -262,7 +263,8 @@ def parts_of(file: str | Table, description: Description, base: Path) -> Iterato
     is cut into parts. One that `[rows]` drops by a single cell is left out (`is_dropped`). `base`
     is the folder of the file, and of the listing in `[windows]`. Raises UnreadableError or
     DataError if the file cannot be read, DataError if it cannot be split, or one of its recordings
-    cannot be cut (those before it are yielded), and SettingError if `windows.trigger` is malformed.
+    cannot be cut (those before it are yielded), SettingError if `windows.trigger` is malformed, and
+    LookupError for an encoding that Python does not know.
     """
     if not isinstance(file, Table):
         file = table_of(read_file(base / file), file, description)
@@ -274,7 +276,8 @@ def parts_of(file: str | Table, description: Description, base: Path) -> Iterato
 def is_dropped(part: Table, rows: Mapping[str, RowWords]) -> bool:
     """Return whether a part has one cell in a column of `[rows]`, whose word drops its rows.
 
-    So has a row of a wide table with the samples of another signal.
+    An example is a row of a wide table that has the samples of another signal. A column that the
+    part lacks, or a word without a stated meaning, drops nothing.
     """
     for name in rows.keys() & part.columns.keys():
         cells = part.columns[name]

@@ -79,10 +79,10 @@ def split(table: Table, description: Description) -> Iterator[Table]:
 
     `long`: the rows with the same words in `part.column` are a part; they must stand together,
     unless `time.sort` is set. `columns`: each column that matches the first channel is a part.
-    `wide`, `npz`, and a file of the formats json, jsonl and ts with one row or with lists as cells:
-    each row is a part; its samples are the list in a cell, or the cells of the columns that match
-    the channel with a number for its `*`, in the order of these numbers. Otherwise the file is one
-    part.
+    `wide`, `npz`, and a file of the formats json, jsonl and ts with one row, or with a list of two
+    or more items in its first row: each row is a part; its samples are the list in a cell, or the
+    cells of the columns that match the channel with a number for its `*`, in the order of these
+    numbers. Otherwise the file is one part.
 
     In numbered columns and in the layout `columns`, empty cells at the end are no samples. A part
     has `damage` if its row is damaged, or if a list of lists or mappings in it has items of
@@ -145,10 +145,11 @@ def _split_wide(table: Table, description: Description) -> Iterator[Table]:
     """Yield the table of each row, which is a part.
 
     A channel like `x*` gets its samples from the columns in which a number stands for the `*`, in
-    the order of these numbers, without empty cells at the end. A list in any other cell becomes a
-    column, or several; a column without a cell for each row is in every part as a whole, and an
-    empty one in none. A part has damage if its row had a wrong number of cells. If the items of a
-    list in it are not all alike, that is its only damage, and it has no columns.
+    the order of these numbers, without empty cells at the end; its unit is that of the first of
+    these columns, and they are in no part themselves. A list in any other cell becomes a column, or
+    several; a column without a cell for each row is in every part as a whole, and an empty one in
+    none. A part has damage if its row had a wrong number of cells. If the items of a list in it are
+    not all alike, that is its only damage, and it has no columns.
     """
     n = len(table.lines)
     origin: dict[str, list[str]] = {}

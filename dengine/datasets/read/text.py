@@ -37,8 +37,10 @@ def read_text(
         How the file is written: the section `[text]`.
     words : container of str, optional
         The columns whose cells are read as texts. The cells of any other column are numbers if the
-        file is plain and pandas reads them all as numbers, otherwise texts. A file is plain if
-        pandas can read it without doubt, and `form.drop` is empty. None: all columns.
+        file is plain and pandas reads them all as numbers; bools if all are True or False, in any
+        of the spellings that pandas knows; otherwise texts. A file is not plain if a row has a
+        wrong number of cells, a line or a last cell is empty, a cell has a line break, `form.drop`
+        is not empty, or a word of `form.missing` ends in a digit. None: all columns.
 
     Returns
     -------
@@ -79,8 +81,8 @@ def to_utf8(content: bytes, encoding: str) -> bytes:
     """Return the bytes of a text in UTF-8, with plain line feeds and without a byte order mark.
 
     `encoding` is the encoding of `content`. Raises UnreadableError, with the line (1 if the
-    encoding does not say where), if a byte does not fit the encoding or if the text has a zero, and
-    LookupError for an encoding that Python does not know.
+    encoding does not say where), if a byte does not fit the encoding or if the text has a zero
+    byte, and LookupError for an encoding that Python does not know.
     """
     try:
         content = content.decode(encoding).removeprefix("\ufeff").encode("utf-8", "replace")
@@ -132,9 +134,9 @@ def _names(top: Sequence[str], header: int, form: TextForm) -> list[str]:
     """Return the names of the columns: those of `text.names`, otherwise the cells of the header.
 
     A last name `x*` of `text.names` becomes `x0`, `x1`, ..., as many as the first row of samples
-    has cells left. In the header a comment mark is skipped, an empty cell is called by its number,
-    like `column1`, and a name that repeats gets a number, like `X.2`. Raises UnreadableError if
-    there are neither names nor a header.
+    has cells left. In the header `#` or `%` at the beginning is skipped, an empty cell is called
+    by its number, like `column1`, and a name that repeats gets a number, like `X.2`. Raises
+    UnreadableError if there are neither names nor a header.
 
     top : the lines from the first to the first row of samples. header : the number of the header's
     line, 0 for none. form : the section `[text]`.
@@ -159,7 +161,8 @@ def _read_plain(
 
     Not plain are a row with a wrong number of cells, an empty line, an empty last cell, and a cell
     with a line break; nor is a file of which `form.drop` leaves out lines, or in which a number
-    means a lost sample. A column that pandas does not read as numbers has texts.
+    means a lost sample. A column of True and False has bools; any other that pandas does not read
+    as numbers has texts.
 
     table : has the names of the columns, which are empty, and the lines of the rows. words : the
     columns whose cells are read as texts; None: all.
@@ -196,11 +199,15 @@ def _read_plain(
 
 
 def _read_strictly(content: bytes, table: Table, form: TextForm) -> Table:
-    """Return the table with all cells as texts, without lines that are empty or dropped.
+    """Return the table with all cells as texts, without empty and dropped lines.
 
-    `table` has the names of the columns and the lines of the rows. Lines that begin with a text of
-    `form.drop` are dropped. A line with a wrong number of cells is added to `damage` of the result,
-    and its row has empty cells. Raises UnreadableError if all lines have a wrong number of cells.
+    A line that has only blanks or tabs is empty, too, also if a tab is the delimiter.
+
+    `content` is as `to_utf8` returns it. Of `table` the names of the columns and the first line
+    number are read: reading begins at this line. Lines that begin with a text of `form.drop` are
+    dropped. If no line is left, the result has no rows. A line with a wrong number of cells is
+    added to `damage` of the result, and its row has empty cells. Raises UnreadableError if all
+    lines have a wrong number of cells.
     """
     n = len(table.columns)
     rows = dict[int, list[str]]()
