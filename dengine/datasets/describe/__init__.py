@@ -232,7 +232,8 @@ def table_in(p: Proposal, content: bytes, name: str) -> Table:
     """
     about = p.description
     if about.format in ("text", "jsonl") and len(content) > MOST_BYTES:
-        content = content[:MOST_BYTES].rpartition(b"\n")[0] or content
+        text = content[:MOST_BYTES].decode(about.text.encoding, "ignore").rpartition("\n")[0]
+        content = text.encode(about.text.encoding) or content
         p.is_cut = True
     if about.format == "text":
         table = read_text(content, name, about.text)

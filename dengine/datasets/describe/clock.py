@@ -19,7 +19,7 @@ from .columns import FORCES, Column, Proposal, Tables
 NAME = re.compile(
     r"time|zeit|stamp|clock|temps|tiempo|tempo|hora|heure|millis|milli?tm|micros|elapsed|epoch"
     r"|(^|\.)(t|ms|us|ns|sec|secs|seconds|date|datum|uhr|x_value)$|^t[ _/\[(]|tick_?count"
-    r"|(^|[._ ])(tm|[mun]sec|tick|(\w+_)?ts)s?($|[._ ])|[\[(][mun\u00b5]?s(ec)?[\])]"
+    r"|^tm$|(^|[._ ])([mun]sec|tick|(\w+_)?ts)s?($|[._ ])|(?<![a-z])[\[(][mun\u00b5]?s(ec)?[\])]"
     r"|tijd|czas|时间|時間|時刻|시간",
     re.IGNORECASE,
 )
@@ -134,17 +134,17 @@ def epoch_of(column: Column) -> str:
 def form_of(column: Column, p: Proposal) -> str:
     """Return the unit or the form of a column of times; `?` if none is certain.
 
-    The form of dates or times of day comes first, then the unit that dates of today prove
-    (`epoch_of`), the unit that the file states, the one in the column's name, like `ms` of `t
-    [ms]`, `t in 0.1 ms` or `millis`, and what the size of the numbers proves. A note on
-    `time.format` in `p` says why it is `?`, or that only the size of the numbers says s. If several
-    forms of dates fit, so that day and month can be confused, the form is `?`.
+    The form of dates or times of day comes first, then the unit that the file states or that stands
+    in brackets in the column's name, the unit that dates of today prove (`epoch_of`), the unit in
+    the name, like `ms` of `t_ms`, `t in 0.1 ms` or `millis`, and what the size of the numbers
+    proves. A note on `time.format` in `p` says why it is `?`, or that only the size of the numbers
+    says s. If several forms of dates fit, so that day and month can be confused, the form is `?`.
     """
     forms = column.forms
     if len(forms) > 1:
         p.notes["time.format"] = f"{listed(forms)}: the cells prove neither"
         return UNKNOWN
-    units = [*forms, epoch_of(column), column.unit]
+    units = [*forms, column.unit, epoch_of(column)]
     if match := UNIT_IN_NAME.search(column.name):
         units.append(match[1].replace(",", "."))
     elif match := NAMED_UNIT.search(column.name):

@@ -295,4 +295,4 @@ def propose_label(p: Proposal) -> None:
     note = f"{counts_of(words.values())}, over {len(words):,} recordings"
     p.notes[f"label.{place}"] = note
     unclear = [key for key in ("good", "bad") if UNKNOWN in getattr(label, key)]
-    p.notes |= {f"label.{key}": f"which words? {note}" for key in unclear}
+    p.notes |= {f"label.{key}": f"which words, also one that may come? {note}" for key in unclear}

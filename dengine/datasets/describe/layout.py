@@ -98,15 +98,15 @@ def parts_of(p: Proposal, files: Tables) -> list[Table]:
     `files` has the table of each file that is looked at, at least one. In the layout `long` a file
     holds several parts, one below the other; if any file was read only in part, the last of several
     parts of each file is left out, since it may be cut. In `columns` each column is a part that
-    fits the first stated channel, if there is one. But those in `[rows]`, and those that are named
-    like a clock in the first file, are no parts; a stated `time.column` is not used. Nothing is set
-    in `p`. Raises DataError if a file of the layout `long` does not have the columns in
-    `part.column`, if none is stated, or if their cells are lists.
+    fits the first stated channel, if there is one. But those in `[rows]`, a stated `time.column`,
+    and those that are named like a clock in the first file, are no parts. Nothing is set in `p`.
+    Raises DataError if a file of the layout `long` does not have the columns in `part.column`, if
+    none is stated, or if their cells are lists.
     """
     description, layout = p.description, p.description.layout
     patterns = [ANY] if layout == "columns" else numbered_columns(files[0])
     if layout == "columns":
-        clock = [*filter(CLOCK_NAME.search, files[0].columns)]
+        clock = [*description.time.column, *filter(CLOCK_NAME.search, files[0].columns)]
         description = description.with_values({"time.column": clock})
     if not description.channels:
         description = replace(description, channels=dict.fromkeys(patterns, Channel()))

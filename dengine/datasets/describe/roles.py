@@ -29,13 +29,17 @@ PART_LINE = re.compile(
     r"(?i)serial|(?<!fixture )barcode|dmc|part ?(no|num|id)|teilenummer|werkst.ck(?!tr)|serien"
 )
 QUALIFIER_NAME = re.compile(
-    r"(?i)status|valid|g(ü|ue)ltig|qualit|flag|error|fehler|fault|d[ée]faut|state|overload|(ü|ue)berl"
-    r"|stale|lost|missing|satur|good|[ _.](ok|io)$|^qc?$"
+    r"(?i)status|valid|g(ü|ue)ltig|qualit|flag|error|fehler|(?<!de)fault(?!.?time)|d[ée]faut|satur(?!d)"
+    r"|(?<!e)state(?!l)|overload|(ü|ue)berl|stale|lost(?!.?time)|missing|good(?!s|.?part)"
+    r"|[ _.](ok|io)$|^qc?$"
 )
 SIGNAL = re.compile(r"(?i)(force|kraft|torque|drehmoment|load|last)([_ ]?[xyz])?")
 LOADS = ("force", "torque")
 SENTINEL = re.compile(r"(?i)-?9{4,}([.,]0+)?|-999[.,]25|-?1([.,]0+)?e\+?3\d|3[.,]4028\d*e\+?38")
-SCALE_NAME = re.compile(r"(?i)(^|[^a-z])(unit|einheit|scale|factor|faktor|.*rate)s?($|[^a-z])")
+SCALE_NAME = re.compile(
+    r"(?i)(^|[^a-z])(unit(?!.*(serial|id|no|nr|under))|einheit|scale|factor|faktor"
+    r"|(sampl\w*|abtast|scan|data)[ _]?rate)s?($|[^a-z])"
+)
 SET_VALUE = re.compile(r"(?i)(^|[^a-z])(set|soll|vorgabe|nominal|target|consigne|max|min|limit)")
 
 # Dates in names. Those in the group `odd` are not sorted by name: they have the day or the month
@@ -104,8 +108,8 @@ def set_rows(p: Proposal, rows: Mapping[str, RowWords]) -> None:
         for i, table in enumerate(tables):
             with suppress(DataError):
                 tables[i] = kept_rows(table, rows)
-        p.tables = tables
-        p.columns = columns_of(tables, p.description.text)
+        p.tables = tables or p.tables
+        p.columns = columns_of(p.tables, p.description.text)
 
 
 def qualify_rows(p: Proposal) -> None:
@@ -159,9 +163,9 @@ def qualifies(column: Column, n_rows: int) -> bool:
     is_named = QUALIFIER_NAME.search(column.name) is not None
     is_verdict = NAME.fullmatch(column.name) is not None
     has_words = any(column.odd) or (is_verdict and column.odd)  # or beside empty cells, a number
-    is_coded = is_named and any(column.odd)
+    is_coded = is_named and {word.lower() for word in column.odd}.difference(LOST)
     is_full = words.total() in (n_rows, len(column.fixed))  # a cell for each row, or recording
-    if not is_full or (len(words) > MOST_WORDS and not is_coded):
+    if not words or not is_full or (len(words) > MOST_WORDS and not is_coded):
         return False
     if not is_named and (not has_words or CLOCK_NAME.search(column.name)):
         return False
@@ -276,9 +280,10 @@ def find_lost(p: Proposal) -> None:
     rows = dict(p.description.rows)
     for column in p.unused:
         words = {word: n for word, n in column.odd.items() if word.lower() not in LOST}
-        if words and sum(column.odd.values()) <= SPARSE * column.counts.total():
+        n_odd = sum(column.odd.values())
+        if words and not column.fixed and n_odd <= SPARSE * column.counts.total():
             rows[column.name] = RowWords((UNKNOWN,))
-            text = f"which rows are samples? Of numbers, and {counts_of(words)}: state drop"
+            text = f"numbers, and {counts_of(words)}: state which to drop, or keep=* if none"
             p.notes[f"rows.{column.name}.keep"] = text
     missing = {*p.description.text.missing}
     strange = dict[str, int]()
@@ -297,7 +302,9 @@ def find_lost(p: Proposal) -> None:
     set_rows(p, rows)
     p.put("text.missing", sorted(missing))
     if strange:
-        p.put("text.missing", UNKNOWN, f"do these mean a lost sample? {counts_of(strange)}")
+        lost = [*sorted(missing), *strange]
+        text = f"do these mean a lost sample? {counts_of(strange)}; if so state {lost}"
+        p.put("text.missing", UNKNOWN, text)
 
 
 def propose_lengths(p: Proposal) -> None:
@@ -321,7 +328,7 @@ def propose_lengths(p: Proposal) -> None:
             )
             is_few = len(others) <= SPARSE * len(lengths)
             p.put("traces.lengths", "strict" if is_few else "pad", text)
-        n_filled = sum(not x[-2:].any() for x in column.numbers)
+        n_filled = sum(len(x) > 1 and not x[-2:].any() for x in column.numbers)
         is_filled = n_filled > SPARSE * len(lengths)
         note = f"{n_filled} recordings end with several zeros: are these samples?"
         p.put("traces.samples", usual, note if is_filled else "")

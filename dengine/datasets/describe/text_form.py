@@ -195,7 +195,7 @@ def propose_form(p: Proposal, contents: Mapping[str, bytes], faults: list[Fault]
     forms = {name: (item.form.delimiter, item.width, item.line) for name, item in looks.items()}
     usual = mode([*forms.values(), ()])
     same = [name for name, form in forms.items() if form == usual]
-    odd = [name for name in forms if name not in same]
+    odd = [name for name, form in forms.items() if form != usual]
     p.others = [*p.others, *odd]
     p.names = [name for name in p.names if name not in odd]
     long = [name for name in odd if len(looks[name].rows) >= LEAST_RUN]

@@ -119,7 +119,8 @@ def read_bag(
                 if topic in topics:
                     cells = {column: field(message) for column, field in fields.items()}
                     rows.append({LOG_TIME: logged, PLACE: 1, STAMP: _stamp_of(message), **cells})
-    frame = pd.DataFrame(rows, columns=[LOG_TIME, PLACE, STAMP, *fields, *places])
+    columns = [LOG_TIME, PLACE, STAMP, *fields, *places]
+    frame = pd.DataFrame(rows, columns=columns, dtype=object)  # whole numbers stay whole
     frame = frame.sort_values([LOG_TIME, PLACE])
     is_row = frame.pop(PLACE) == 1
     if not is_row.any():

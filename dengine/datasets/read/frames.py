@@ -92,7 +92,8 @@ def _turned(value: Any) -> Mapping[Any, Any] | None:
     """Return a list of mappings as one mapping of lists by key, a list of lists as one by channel.
 
     Mappings that hold lists, like `{"name": "force", "data": [...]}`, become one for each name, if
-    the texts under some key are all different; the first such key counts.
+    the texts under some key are all different, and a list is longer than there are names; the
+    first such key counts.
 
     The shorter axis of a list of lists is the channels (of equal ones the first), which are
     numbered from 0. A NumPy array counts as a list. A mapping is returned as it is, and None for
@@ -105,7 +106,8 @@ def _turned(value: Any) -> Mapping[Any, Any] | None:
     first = value[0] if isinstance(value, ITEMS) and len(value) else None
     if isinstance(first, Mapping):
         columns = {key: [item[key] for item in value] for key in first}
-        has_curve = any(isinstance(cells[0], ITEMS) for cells in columns.values())
+        lists = [cells[0] for cells in columns.values() if isinstance(cells[0], ITEMS)]
+        has_curve = max(map(len, lists), default=0) > len(value)
         for cells in columns.values() if has_curve else ():
             if {*map(type, cells)} == {str} and len({*cells}) == len(cells):
                 return dict(zip(cells, value, strict=True))

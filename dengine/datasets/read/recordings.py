@@ -71,7 +71,8 @@ def recording_of(
         seconds = times_of(table, clock, form)
         if clock.sort:
             rows = np.argsort(seconds, kind="stable")
-            table = table.take(rows)
+            with instead(UnreadableError, "Expected columns of one length", IndexError):
+                table = table.take(rows)
             seconds = seconds[rows]
         check_steps(seconds, clock, table)
         rank = seconds[0] if order == "time" else rank
@@ -111,7 +112,7 @@ def kept_rows(table: Table, rows: Mapping[str, RowWords]) -> Table:
         kinds = np.array(about.kinds(table.words(column)), dtype=np.str_)
         wanted = f"one of the words {listed(sorted(about.keep + about.drop + about.invalid))}"
         table.refuse(kinds == "", wanted, column)
-        if len(kinds) > 1:
+        if len(kinds) != 1:
             table = table.take(kinds != "drop")
     return table
 

@@ -7,7 +7,7 @@ from itertools import chain
 
 import numpy as np
 
-from ...errors import DataError
+from ...errors import DataError, instead
 from ..description import ANY, ORDERS, Description
 from ..table import Cells, Table, UnreadableError, as_word
 from ..triggers import as_trigger
@@ -159,7 +159,8 @@ def _split_wide(table: Table, description: Description) -> Iterator[Table]:
         if names := [match[0] for match in match_numbered(key, table.columns)]:
             origin[key] = names
             units[key] = units.get(names[0], "")
-            cells[key] = np.stack([*map(table.column, names)], axis=1)
+            with instead(UnreadableError, f"Expected columns of one length in {key}", ValueError):
+                cells[key] = np.stack([*map(table.column, names)], axis=1)
     for name in chain(*origin.values()):
         cells.pop(name, None)
     for i, line in enumerate(table.lines):

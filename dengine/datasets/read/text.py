@@ -160,17 +160,19 @@ def _read_plain(
     """Return the table with its columns, read by pandas; None if the file is not plain.
 
     Not plain are a row with a wrong number of cells, an empty line, an empty last cell, and a cell
-    with a line break; nor is a file of which `form.drop` leaves out lines, or in which a number
-    means a lost sample. A column of True and False has bools; any other that pandas does not read
-    as numbers has texts.
+    with a line break; nor is a file of which `form.drop` leaves out lines. If a number means a lost
+    sample, all columns have texts. A column of True and False has bools; any other that pandas does
+    not read as numbers has texts.
 
     table : has the names of the columns, which are empty, and the lines of the rows. words : the
     columns whose cells are read as texts; None: all.
     """
     import pandas as pd
 
-    if form.drop or any(word[-1:].isdigit() for word in form.missing):
+    if form.drop:
         return None
+    if any(word[-1:].isdigit() for word in form.missing):
+        words = None  # pandas would read them as numbers
     texts = [name for name in table.columns if words is None or name in words]
     try:
         frame = pd.read_csv(
@@ -225,4 +227,4 @@ def _read_strictly(content: bytes, table: Table, form: TextForm) -> Table:
         raise damage[0]
     cells = np.array([*rows.values()], dtype=object).reshape(-1, n).T
     columns = dict(zip(table.columns, cells, strict=True))
-    return replace(table, columns=columns, lines=[*rows], damage=damage)
+    return replace(table, columns=columns, lines=np.array([*rows]), damage=damage)

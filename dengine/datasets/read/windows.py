@@ -123,4 +123,4 @@ def _listed(table: Table, times: Floats, description: Description, base: Path) -
                 "overlaps the window before"
             )
         least = max(least, end - TOLERANCE)
-        yield key, slice(rows[0], rows[-1] + 1) if len(rows) else slice(1), fault
+        yield key, slice(rows[0], rows[-1] + 1) if len(rows) else slice(0, 1), fault
