@@ -29,6 +29,7 @@ OPTION = re.compile(
     rf"(?<![\w=])'[^']*'|(?<!:)\b({OPTIONS})=('[^']*'|\"[^\"]*\"|[\w.]+)|(?<=\()({OPTIONS})=?(?=\))"
 )
 TRACE_SPEC = re.compile(r"(?:DataEngine\(trace=)?TraceSpec\(([^()]*)\)\)?")
+MOST = 1000  # characters at each end of a text in which passwords are looked for
 MAX_LENGTH = 60  # characters of a value in a message
 _REPR = reprlib.Repr()
 _REPR.maxstring = _REPR.maxother = _REPR.maxlong = MAX_LENGTH
@@ -51,7 +52,9 @@ def shortened(value: Any) -> str:
     "..." stands for its middle. A container shows only its first items (six of a list or tuple,
     four of a dict), each of them cut like this.
     """
-    return _REPR.repr(without_password(value) if isinstance(value, str) else value)
+    if isinstance(value, str):  # of a long one only the ends are shown
+        value = without_password(value if len(value) < MOST else value[:MOST] + value[-MOST:])
+    return _REPR.repr(value)
 
 
 def listed(names: Iterable[Any]) -> str:
