@@ -29,7 +29,7 @@ OPTION = re.compile(
     rf"(?<![\w=])'[^']*'|(?<!:)\b({OPTIONS})=('[^']*'|\"[^\"]*\"|[\w.]+)|(?<=\()({OPTIONS})=?(?=\))"
 )
 TRACE_SPEC = re.compile(r"(?:DataEngine\(trace=)?TraceSpec\(([^()]*)\)\)?")
-MOST = 1000  # characters at each end of a text in which passwords are looked for
+MOST = 1000  # characters of a value in which passwords are looked for
 MAX_LENGTH = 60  # characters of a value in a message
 _REPR = reprlib.Repr()
 _REPR.maxstring = _REPR.maxother = _REPR.maxlong = MAX_LENGTH
@@ -48,12 +48,12 @@ def without_password(text: str) -> str:
 def shortened(value: Any) -> str:
     """Return the `repr` of a value for a message.
 
-    In a text the passwords of database URLs are masked first. If it is longer than 60 characters,
-    "..." stands for its middle. A container shows only its first items (six of a list or tuple,
-    four of a dict), each of them cut like this.
+    In a text of fewer than 1,000 characters the passwords of database URLs are masked first. If it
+    is longer than 60 characters, "..." stands for its middle. A container shows only its first
+    items (six of a list or tuple, four of a dict), each of them cut like this.
     """
-    if isinstance(value, str):  # of a long one only the ends are shown
-        value = without_password(value if len(value) < MOST else value[:MOST] + value[-MOST:])
+    if isinstance(value, str) and len(value) < MOST:
+        value = without_password(value)
     return _REPR.repr(value)
 
 

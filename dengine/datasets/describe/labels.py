@@ -60,6 +60,7 @@ PLACES = (  # of any words: folders, and the words of a file's name, counted fro
     "([^-_ /]+)(?:[-_ ][^-_ /]*){3}$",
     "(?:^|/)([^-_ /]+)[^/]*$",
 )
+OWN = ("npz", "y", (), {"0", "1"})  # labels as dengine's own archives have them
 NO_LABEL = "none was found that is certain: state label.column, path, line or listing"
 Names = Iterable[str]
 Words = Mapping[str, str]  # by recording
@@ -229,8 +230,9 @@ def count_sources(p: Proposal, stated: Sequence[LabelSource]) -> dict[LabelSourc
     source with the same words as an earlier one counts only if it is named like a verdict. For
     listings and paths all recordings count, since their names are enough; for columns and lines
     only those whose tables were read. The words are sorted into good, bad and unchecked as
-    `with_meanings` does. Raises DataError if the stated source has no words or cannot be read, and
-    SettingError for a malformed `windows.trigger`.
+    `with_meanings` does; but in an archive of all parts 1 is good in an array y of 1 and 0. Raises
+    DataError if the stated source has no words or cannot be read, and SettingError for a malformed
+    `windows.trigger`.
 
     stated : the source that the user stated, `[label]`; empty if there is none.
     """
@@ -244,6 +246,8 @@ def count_sources(p: Proposal, stated: Sequence[LabelSource]) -> dict[LabelSourc
         is_new = words not in counted.values() or is_named_like_verdict(source)
         is_common = 2 * len(words) > len(tables if source.listing or source.path else p.tables)
         if stated or (is_new and is_common and may_be_labels(source, words.values())):
+            if (p.description.layout, source.column, source.good, {*words.values()}) == OWN:
+                source = replace(source, good=("1",), bad=("0",))
             counted[with_meanings(source, words.values())] = words
     return counted
 

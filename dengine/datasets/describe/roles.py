@@ -176,6 +176,16 @@ def qualifies(column: Column, n_rows: int) -> bool:
     return is_named and not (is_verdict and has_meaning(LabelSource(column=column.name), words))
 
 
+def sources_named(p: Proposal, column: re.Pattern[str], line: re.Pattern[str]) -> list[PartSource]:
+    """Return the columns without a role and the lines above the header whose names are like these.
+
+    `column` is searched in the names of columns, and `line` in those of lines of the first table.
+    Raises SettingError for a malformed `windows.trigger`.
+    """
+    sources = [PartSource((c.name,)) for c in p.unused if column.search(c.name)]
+    return sources + [PartSource(line=name) for name in filter(line.search, lines_of(p))]
+
+
 def propose_part(p: Proposal) -> None:
     """Set `[part]` in `p` to the column or the line above the header that has the part's number.
 
@@ -184,10 +194,9 @@ def propose_part(p: Proposal) -> None:
     the first table. If none qualifies, or several do, nothing is set. A `[part]` that is set
     already stays. Raises SettingError for a malformed `windows.trigger`.
     """
-    sources = [PartSource((c.name,)) for c in p.unused if PART_NAME.search(c.name)]
-    sources += [PartSource(line=line) for line in filter(PART_LINE.search, lines_of(p))]
     least = len(p.tables) / 2
-    sources = [s for s in sources if len({*part_words(s, p.tables).values()}) > least]
+    named = sources_named(p, PART_NAME, PART_LINE)
+    sources = [s for s in named if len({*part_words(s, p.tables).values()}) > least]
     if p.description.part == PartSource() and len(sources) == 1:
         p.description = replace(p.description, part=sources[0])
 
@@ -245,12 +254,10 @@ def _other_scales(p: Proposal) -> Iterator[str]:
     role, and the lines are those of the first table. Raises SettingError for a malformed
     `windows.trigger`.
     """
-    sources = [PartSource((column.name,)) for column in p.unused]
-    sources += [PartSource(line=line) for line in lines_of(p)]
-    for source in sources:
-        name = " ".join(source.column) or source.line
-        words = [*part_words(source, p.tables).values()] if SCALE_NAME.search(name) else []
+    for source in sources_named(p, SCALE_NAME, SCALE_NAME):
+        words = part_words(source, p.tables).values()
         if len({*words}) > 1:
+            name = source.line or source.column[0]
             yield f"{name} differs, {counts_of(words)}: convert them first, or state channels"
 
 
@@ -328,10 +335,9 @@ def propose_lengths(p: Proposal) -> None:
             )
             is_few = len(others) <= SPARSE * len(lengths)
             p.put("traces.lengths", "strict" if is_few else "pad", text)
-        n_filled = sum(len(x) > 1 and not x[-2:].any() for x in column.numbers)
-        is_filled = n_filled > SPARSE * len(lengths)
+        n_filled = sum(np.array_equal(x[-2:], [0, 0]) for x in column.numbers)
         note = f"{n_filled} recordings end with several zeros: are these samples?"
-        p.put("traces.samples", usual, note if is_filled else "")
+        p.put("traces.samples", usual, note if n_filled > SPARSE * len(lengths) else "")
 
 
 def propose_order(p: Proposal) -> None:

@@ -119,8 +119,9 @@ def read_bag(
                 if topic in topics:
                     cells = {column: field(message) for column, field in fields.items()}
                     rows.append({LOG_TIME: logged, PLACE: 1, STAMP: _stamp_of(message), **cells})
-    columns = [LOG_TIME, PLACE, STAMP, *fields, *places]
-    frame = pd.DataFrame(rows, columns=columns, dtype=object)  # whole numbers stay whole
+    frame = pd.DataFrame(  # of objects: whole numbers stay whole
+        rows, columns=[LOG_TIME, PLACE, STAMP, *fields, *places], dtype=object
+    )
     frame = frame.sort_values([LOG_TIME, PLACE])
     is_row = frame.pop(PLACE) == 1
     if not is_row.any():
