@@ -53,14 +53,13 @@ def match_files(root: Path, patterns: Sequence[str]) -> set[str]:
     """Return the files below a folder that any pattern matches, as paths relative to the folder.
 
     The paths have `/` between folders. Folders that match are left out; `**` at the end stands for
-    all files below. A pattern that is a file's path matches it, also with brackets in it. Raises
-    DataError for a malformed pattern.
+    all files below. Raises DataError for a malformed pattern.
     """
     with instead(
         DataError, f"Expected patterns below a folder in files and exclude, got {patterns}", *BAD
     ):
-        found = [root.glob(f"{p}/*" if p.endswith("**") else p) for p in patterns]
-        paths = [*chain(*found), *(root / name for name in patterns)]  # a name may have brackets
+        found = (root.glob(f"{p}/*" if p.endswith("**") else p) for p in patterns)
+        paths = [*chain(*found)]
     return {path.relative_to(root).as_posix() for path in paths if path.is_file()}
 
 
