@@ -80,7 +80,8 @@ def without_repeats(recordings: Sequence[Recording]) -> tuple[list[Recording], l
     The recordings kept stay in their order. All traces must have the same shape (C, T). Two traces
     are equal if they have the same `content_hash`, which rounds samples down to 1/65,536 of their
     unit, and counts lost samples as 0. Of equal traces with one label the first is kept; if their
-    labels differ, none is kept. So it is with traces of a dead sensor, which never train.
+    labels differ, none is kept. This also holds for traces of a dead sensor (all samples are
+    equal), although the engine never trains on them.
     """
     traces = [recording.trace for recording in recordings]
     hashes = content_hash(np.stack(traces)).tolist() if traces else []

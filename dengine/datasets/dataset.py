@@ -168,7 +168,7 @@ class Dataset:
         are several channels, `x0_0`, `x0_1`, ... Its metadata (`attrs`, under "dengine") has the
         fields `channels`, `rate_hz`, `unit`, `limit` and `fit` and the number of channels, so that
         `load_dataset` reads what `data.to_frame().to_parquet("data.parquet")` writes, without a
-        description. All other fields are lost.
+        description. All other fields are lost. The frame may share its memory with X.
         """
         import pandas as pd
 
@@ -187,7 +187,8 @@ class Dataset:
 
         Its X is a copy, for one channel of shape (n, T). `channels` and `unit` become those of the
         selected channels; all other fields stay. Raises DataError for an unknown name, for no name,
-        and if the channels of the data set have no names, and SettingError where `spec` does.
+        and if the channels of the data set have no names, and SettingError where `spec` does. A
+        name that comes twice passes, but `spec` of the result then raises SettingError.
         """
         names = ", ".join(self.channels) or "none, its channels have no names"
         is_known = set() < {*channels} <= {*self.channels}
@@ -256,8 +257,9 @@ def make_dataset(
     DataError
         If X has no trace, another shape, more channels than samples, or values that are no real
         numbers; if y, part, cause or the names of the channels do not fit X; if a label is neither
-        1 nor 0, or a part's number neither a text nor an integer; or if the rate is not between
-        1 Hz and 1 MHz, both included. NaN and infinities in X pass.
+        1 nor 0, or a part's number neither a text nor an integer; if `part` becomes an array of
+        dtype object, even one of texts, like a column of pandas; or if the rate is not between
+        1 Hz and 1 MHz, both included. NaN and infinities in X pass, and so do equal names.
     TypeError
         If `about` has a name that is no other field of `Dataset`.
     """

@@ -80,9 +80,9 @@ def describe(source: Any, stated: Stated | None = None) -> Description:
     DataError
         If there is no file, or none that can be read and holds samples, or if the package that
         reads such files is not installed. Also if a stated value is wrong: an unknown key or a
-        value of the wrong type, a column of times or a channel that does not exist, a source of
-        labels that has no words, a malformed pattern of files, or settings in `[text]` or `[time]`
-        that no file can be read with.
+        value of the wrong type, a column of times or a channel that does not exist (a bag's are not
+        checked), a source of labels that has no words, a malformed pattern of files, or settings in
+        `[text]` or `[time]` that no file can be read with.
     SettingError
         If a stated `windows.trigger`, which cuts long recordings, is malformed.
     ValueError
@@ -112,8 +112,8 @@ def choose_files(p: Proposal, root: Path) -> bool:
     lists them, a note on `channels` says so, and the result is False. Otherwise `p.base` becomes
     the folder, `p.names` these files and `p.others` the other files that `names_in` finds without
     patterns. `files` becomes `globs` of the names, and `format` that of the first file's suffix,
-    `text` for an unknown one; stated keys stay. Raises DataError if there is no file of recordings
-    or a stated pattern is malformed.
+    `text` for an unknown one; stated keys stay. `exclude` is not looked at. Raises DataError if
+    there is no file of recordings or a stated pattern is malformed.
     """
     stated = p.description.files
     every = names_in(root, ())
@@ -139,9 +139,9 @@ def likely_endings(names: Names) -> Names:
     They are the suffixes that several files have, and `.mcap` if one file has it; or else all. If
     there is only one, the endings that tell signals apart come before it: `Kraft.csv` of
     `1_Kraft.csv`, the last word with its suffix, behind the part. There must be two parts and two
-    such endings or more, and each part must have a file with each ending. An ending that is a word
-    like `ok` or `pending` tells no signal. Endings with digits count only if there are 2 to 4 of
-    them and 10 parts or more: numbered pieces of a part's curve.
+    such endings or more, and each part must have a file with each ending. If any ending is a word
+    like `ok` or `pending`, none counts. If any has a digit, they count only if there are 2 to 4
+    endings and 10 parts or more: numbered pieces of a part's curve.
     """
     counts = Counter(map(suffix_of, names))
     likely = [suffix for suffix, n in counts.items() if n > 1 or suffix == BAG] or [*counts]

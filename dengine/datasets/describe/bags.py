@@ -28,13 +28,15 @@ def propose_bag(p: Proposal) -> None:
     headers if the first message of each topic has it, apart from topics with a field `data`, else
     the time of the log; a time in a header below 1 s counts as none. The rate, `order` and
     `time.gap` follow from the times of the log in any case (`propose_rate`), those of the first
-    channel's topic. `traces.samples` is set to `?` unless it is stated; so is `windows.trigger`
-    unless it or `windows.listing` is stated, and `label.topic` unless anything of the label is
-    stated. The notes on the last two list the topics with a field `data`, and their words. The
-    words of a stated topic of labels are sorted into good and bad. Fields that are no channels
-    become `ignored`. Stated keys stay. Raises DataError if the file is no bag or is damaged before
-    its first message, or if the package that reads bags is missing, or if a setting in `[time]` is
-    wrong; a later damage only ends the reading.
+    channel's topic, or of the first number's if there is no channel. Whether stated channels are in
+    the bag is not checked. `traces.samples` is set to `?` unless it is stated; so is
+    `windows.trigger` unless it or `windows.listing` is stated, and `label.topic` unless anything of
+    the label is stated. The notes on the last two list the topics with a field `data`, and their
+    words. The words of a stated topic of labels are sorted into good and bad; with any other stated
+    source the lists that are not stated become `?`. Fields that are no channels become `ignored`.
+    Stated keys stay. Raises DataError if the file is no bag or is damaged before its first message,
+    or if the package that reads bags is missing, or if a setting in `[time]` is wrong; a later
+    damage only ends the reading.
     """
     times, words = defaultdict[str, list[int]](list), defaultdict[str, list[str]](list)
     units = dict[str, str]()

@@ -102,9 +102,10 @@ def is_clock(column: Column) -> bool:
 def is_counter(column: Column) -> bool:
     """Return whether numbers may count the samples, or tell the time, under a name of no clock.
 
-    They have equal steps, but not of 0 or 1; or unequal ones, in a column that is named like a
-    counter (`index`, `sample`, `n`, ...). A column like `x*`, the samples of a wide table, is none,
-    nor is one that is named like a force or has a unit of another quantity.
+    They do in a column that is named like a counter (`index`, `sample`, `n`, ...) if the steps are
+    unequal, and in any other if they are equal, within 1 %, but not 0 or 1. Of the others, one like
+    `x*`, the samples of a wide table, is none, nor is one that is named like a force or has a unit
+    of another quantity.
     """
     steps = column.steps
     usual = float(np.median(steps)) if len(steps) else 0.0
@@ -159,9 +160,10 @@ def form_of(column: Column, p: Proposal) -> str:
 def _unit_by_size(column: Column, p: Proposal) -> str:
     """Return the unit of time that the steps in a column prove; `?`, with a note, if none.
 
-    If the median of the steps is 0.0002 to 0.019, the unit is s, and a note on `time.format` in `p`
-    says so. Otherwise it is `?`, and the note lists units with the rates that they give. It is `?`,
-    too, if the column has no numbers that rise; the note then asks for the form of its cells.
+    The steps count without sign, and those of 0 do not. If their median is 0.0002 to 0.019, it is
+    s, and a note on `time.format` in `p` says so. Otherwise it is `?`, and the note lists units
+    with the rates that they give. It is `?`, too, if the column has no numbers that change; the
+    note then asks for the form of its cells.
     """
     rising = np.abs(column.steps[column.steps != 0])  # or falling, with the newest row first
     if not len(rising):
@@ -187,15 +189,15 @@ def is_rate(step: float) -> bool:
 def propose_rate(p: Proposal, tables: Tables) -> None:
     """Set `time.rate_hz` in `p`, from the median over the recordings of the mean step of time.
 
-    `tables` has the samples of each recording. Steps below 0 are left out of the mean, unless the
-    user stated `time.sort`, and the rate is rounded to five digits. It is `?`, with a note, if it
-    is not between 1 Hz and 1 MHz, like that of times that only fall; then `time.gap`, the longest
-    step that is allowed, is not looked at. Otherwise `check_steps` checks the times, by the rate
-    and the gap that the description has by then. If it refuses more recordings than 10 % plus one,
-    `time.gap` is set to `?`, with a note on the first. If all recordings start after 1999 (UTC),
-    `order` is set to `time`, also if the rate is `?`. Recordings whose times cannot be read are
-    skipped. Stated keys stay. Raises DataError if a stated format is no form or unit of times, or
-    if a setting in `[time]` is wrong (see `check_forms`).
+    `tables` has the samples of each recording. With `time.sort` the times of each are sorted first.
+    Steps below 0 are left out of the mean, and the rate is rounded to five digits. It is `?`, with
+    a note, if it is not between 1 Hz and 1 MHz, like that of times that only fall; then `time.gap`,
+    the longest step that is allowed, is not looked at. Otherwise `check_steps` checks the times, by
+    the rate and the gap that the description has by then. If it refuses more recordings than 10 %
+    plus one, `time.gap` is set to `?`, with a note on the first. If all recordings start after 1999
+    (UTC), `order` is set to `time`, also if the rate is `?`. Recordings whose times cannot be read
+    are skipped. Stated keys stay. Raises DataError if a stated format is no form or unit of times,
+    or if a setting in `[time]` is wrong (see `check_forms`).
     """
     clock = p.description.time
     check_forms(clock, TextForm())  # the marks in numbers may be ? by now

@@ -100,10 +100,10 @@ def has_meaning(source: LabelSource, words: Names) -> bool:
 def in_paths(paths: Names) -> list[str]:
     """Return the regular expressions that find words like "ok" or "failed" in paths.
 
-    Such a word is the name of a folder, or begins or ends a file name; numbers may stand behind it
-    at the end. A word for unchecked is one, too, like "pending". Each expression has only the words
-    that it finds. The list is empty if any path negates such a word, like "not_passed", or has true
-    or false after a name, like "leak=False": the meaning is open then.
+    Such a word is or ends the name of a folder, or begins or ends a file name; numbers may stand
+    behind it at the end. A word for unchecked is one, too, like "pending". Each expression has only
+    the words that it finds. The list is empty if any path negates such a word, like "not_passed",
+    or has true or false after a name, like "leak=False": the meaning is open then.
     """
     stems = [*map(without_suffix, paths)]
     patterns = []
@@ -154,9 +154,9 @@ def lines_of(p: Proposal) -> list[str]:
 def part_words(source: PartSource, tables: Tables) -> Words:
     """Return the part number of each recording that has one, by the recording's `Table.source`.
 
-    `source` says where the number stands; it is "" if that states nothing. `tables` has the table
-    of each recording. Recordings whose number is missing, empty or not the same in all rows are
-    left out, and all of them if the path in `source` is no valid expression.
+    `source` says where the number stands; if it states nothing, each number is "". `tables` has the
+    table of each recording. Recordings whose number is missing, empty or not the same in all rows
+    are left out, and all of them if the path in `source` is no valid expression.
     """
     words = dict[str, str]()
     for table in tables:
@@ -173,7 +173,8 @@ def sources_of(p: Proposal, paths: Names) -> Iterator[LabelSource]:
     the other may hold labels; regular expressions for the paths (if a file or a column is a part),
     of words like "ok" in them and of any words at fixed places; columns without another use that
     have one word in all rows of a recording; and lines above the header. A file that cannot be read
-    as a listing is skipped.
+    as a listing is skipped. Raises SettingError for a malformed `windows.trigger`, and
+    UnreadableError if cells of a column without another use are lists.
 
     paths : the path of each recording.
     """
@@ -257,13 +258,15 @@ def propose_label(p: Proposal) -> None:
 
     A source is certain if it is named like a verdict or stated, has words for good and for bad, and
     all its words have a known meaning. The first certain source becomes the label, unless another
-    source contradicts it. If none is certain, but only one is named like a verdict, that becomes
-    the label, with `?` for words whose meaning is open; but if it has only known words, like "ok",
-    this holds only if there is no other source. Otherwise `label.column` is `?`, with a note that
-    lists all sources. Further certain sources that have a word for each recording of the label
-    become checks, unless checks are stated; a note counts the words of the label, also on
-    `label.good` and `label.bad` if these are `?`. Raises DataError if a stated source has no words
-    or cannot be read, and SettingError for a malformed `windows.trigger`.
+    source contradicts it: good by one, bad by the other. If none is certain, but only one is named
+    like a verdict, that becomes the label, with `?` for words whose meaning is open; but if it has
+    only known words, like "ok", this holds only if there is no other source. Sources that have the
+    same word for each recording count as one here, and the first that is named like a verdict is
+    used. Otherwise `label.column` is `?`, with a note that lists all sources. Further certain
+    sources that have a word for each recording of the label become checks, unless checks are
+    stated; a note counts the words of the label, also on `label.good` and `label.bad` if these are
+    `?`. Raises DataError if a stated source has no words or cannot be read, and SettingError for a
+    malformed `windows.trigger`.
     """
     label = p.description.label
     stated = [label] if any(getattr(label, kind) for kind in SOURCES) else []
