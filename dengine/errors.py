@@ -29,7 +29,7 @@ OPTION = re.compile(
     rf"(?<![\w=])'[^']*'|(?<!:)\b({OPTIONS})=('[^']*'|\"[^\"]*\"|[\w.]+)|(?<=\()({OPTIONS})=?(?=\))"
 )
 TRACE_SPEC = re.compile(r"(?:DataEngine\(trace=)?TraceSpec\(([^()]*)\)\)?")
-MOST = 1000  # characters of a value in which passwords are looked for
+MOST = 1000  # characters of a text in which passwords are looked for: URL takes time to search
 MAX_LENGTH = 60  # characters of a value in a message
 _REPR = reprlib.Repr()
 _REPR.maxstring = _REPR.maxother = _REPR.maxlong = MAX_LENGTH
@@ -53,7 +53,7 @@ def shortened(value: Any) -> str:
     items (six of a list or tuple, four of a dict), each of them cut like this.
     """
     if isinstance(value, str) and len(value) < MOST:
-        value = without_password(value)
+        value = without_password(value)  # before it is cut, or half a password would stay
     return _REPR.repr(value)
 
 

@@ -86,8 +86,8 @@ def backup_store(url: FilePath, out: FilePath) -> BackupReport:
     OSError
         If the disk fails while the records of a journal are read.
     """
-    log_file = f"{os.fspath(out)}-wal"  # SQLite would take its rows for the copy's
-    expect(not Path(log_file).exists(), f"no {log_file}", "one", "move it away", OutputError)
+    log_file = Path(f"{os.fspath(out)}-wal")  # SQLite would take its rows for the copy's
+    expect(not log_file.exists(), f"no {log_file}", "one", "move it away", OutputError)
     with reading(os.fspath(url)) as connection:
         dialect = connection.dialect.name
         expect(

@@ -15,6 +15,7 @@ from .journal import Record
 from .queries import WITH_TRACES
 from .records import (
     FORGOTTEN,
+    LABEL_TEXTS,
     LATE_STOP,
     Event,
     LabelNumbers,
@@ -231,5 +232,5 @@ def _describe(record: Record) -> str:
         return f"an event, {record.text!r}"
     if isinstance(record, StoredDecision):
         return f"a decision, {record.decision.id!r}"
-    result = "success" if record.success else "failure"
-    return f"a label, {result} from {record.source.value}, on {record.decision_id!r}"
+    label = f"{LABEL_TEXTS[record.success]} from {record.source.value}"
+    return f"a label, {label}, on {record.decision_id!r}"

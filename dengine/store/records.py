@@ -51,9 +51,9 @@ Row = dict[str, Any]  # the values of a row, by column
 LabelNumbers = list[tuple[str, int]]  # ids of decisions, with the numbers of their labels
 EntryName = tuple[int, str]  # number and digest, hexadecimal, of a ledger entry
 NO_TRACE: TraceArray = np.zeros((0, 0), dtype=np.float32)
+LABEL_TEXTS = {True: "success", False: "failure", None: "a forgotten label"}
 # The first label and a second one that replaces it: silence confirmed the part, then it stopped the
 # line.
-LABEL_TEXTS = {True: "success", False: "failure", None: "a forgotten label"}
 LATE_STOP = (True, Source.CONFIRMED), (False, Source.STOP)
 LABEL_WORDS = {True: "good", False: "bad", None: "none"}
 FORGOTTEN = 2  # beside 0 and 1: a label that takes part in nothing any more

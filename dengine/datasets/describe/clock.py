@@ -93,10 +93,10 @@ def is_clock(column: Column) -> bool:
     is_named = NAME.search(column.name) is not None
     if column.forms or (is_named and column.odd):
         return not column.fixed
-    if not is_named or quantity_of(column.unit):
+    if not is_named or quantity_of(column.unit) or not column.usual_step:
         return False
-    falls = (column.steps < 0).mean() if column.steps.any() else 0.5
-    return bool(abs(falls - 0.5) >= 0.5 - FEW)
+    falls = (column.steps < 0).mean()
+    return bool(min(falls, 1 - falls) <= FEW)
 
 
 def is_counter(column: Column) -> bool:
@@ -120,15 +120,15 @@ def epoch_of(column: Column) -> str:
     """Return the unit in which a column of times counts from a known day; "" if it does not.
 
     With it the first number is a time in the years 2000 to 2050, counted from 1970 or from another
-    day that clocks use, and the median of the steps is of a rate of 1 Hz to 1 MHz. The first in
+    day that clocks use, and `Column.usual_step` is of a rate of 1 Hz to 1 MHz. The first unit in
     `EPOCHS` counts.
     """
-    steps = np.abs(column.steps[column.steps != 0])  # falling, if the newest row is the first
-    for unit, zero in EPOCHS if len(steps) else ():
+    for unit, zero in EPOCHS:
         scale = scale_of(unit)
-        moment = float(np.concatenate(column.numbers)[0]) * scale - zero
-        if YEARS[0] <= moment <= YEARS[1] and is_rate(float(np.median(steps)) * scale):
-            return unit
+        if is_rate(column.usual_step * scale):
+            moment = np.concatenate(column.numbers)[0] * scale - zero
+            if YEARS[0] <= moment <= YEARS[1]:
+                return unit
     return ""
 
 
@@ -160,19 +160,17 @@ def form_of(column: Column, p: Proposal) -> str:
 def _unit_by_size(column: Column, p: Proposal) -> str:
     """Return the unit of time that the steps in a column prove; `?`, with a note, if none.
 
-    The steps count without sign, and those of 0 do not. If their median is 0.0002 to 0.019, it is
-    s, and a note on `time.format` in `p` says so. Otherwise it is `?`, and the note lists units
-    with the rates that they give. It is `?`, too, if the column has no numbers that change; the
-    note then asks for the form of its cells.
+    If `Column.usual_step` is 0.0002 to 0.019, it is s, and a note on `time.format` in `p` says so.
+    Otherwise it is `?`, and the note lists units with the rates that they give. It is `?`, too, if
+    the column has no numbers that change; the note then asks for the form of its cells.
     """
-    rising = np.abs(column.steps[column.steps != 0])  # or falling, with the newest row first
-    if not len(rising):
+    step = column.usual_step
+    if not step:
         odd = listed([*column.odd][:3])
         p.notes["time.format"] = (
             f"no form of times that is known fits {odd}: state it, or text.drop"
         )
         return UNKNOWN
-    step = float(np.median(rising))
     if SECONDS[0] <= step <= SECONDS[1]:
         p.notes["time.format"] = f"seconds, for steps of {step:.6g}; the unit is not stated"
         return "s"

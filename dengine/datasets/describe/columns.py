@@ -123,6 +123,14 @@ class Column:
         return np.concatenate([np.empty(0), *map(np.diff, self.numbers)])
 
     @cached_property
+    def usual_step(self) -> float:
+        """The median of `steps` without those of 0, and without sign; 0 if there is none.
+
+        Times fall if the newest row is the first.
+        """
+        return float(np.median(np.abs(self.steps[self.steps != 0]))) if self.steps.any() else 0.0
+
+    @cached_property
     def unit(self) -> str:
         """The unit that most files state for the column, or else the one in its name, or "".
 

@@ -12,7 +12,8 @@ from .clock import NAME as CLOCK_NAME
 from .columns import LEAST_RUN, Column, Proposal, Tables, columns_of
 
 PART_NAME = re.compile(
-    r"(?i)part|serial|episode|teil(?!schritt)|werkst(?!.*tr(ä|ae?)ger)|barcode|dmc|trial|piece|sample_?id"
+    r"(?i)part|serial|episode|teil(?!schritt)|werkst(?!.*tr(ä|ae?)ger)|barcode|dmc|trial|piece"
+    r"|sample_?id"
     r"|^(id|run|sn|cycle|shot|nr|no)$|(?<!order)(?<!batch)(?<!shift)(?<!lot)_(id|run|cycle|sn|nr)$"
 )
 NUMBER = re.compile(r"\d+(\.\d+)?(e-?\d+)?(?=[\])]?( ?[\[(][^\d\[(]+[\])])?$)")  # as in `F_0.5 [N]`

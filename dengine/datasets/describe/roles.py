@@ -219,7 +219,7 @@ def propose_channels(p: Proposal, units: Mapping[str, str]) -> None:
     likely = [name for name, unit in units.items() if not unit or name in forces]
     named = [[*filter(pattern.search, likely)] for pattern in FORCES]
     best = next(filter(None, (*named[:2], forces, named[2], [*units])), [])
-    if forces and not {*best} & {*forces}:
+    if not {*best} & {*forces}:
         best = [*best, *forces]  # one has the name, another the unit
     doubts = [*filter(None, (*(_doubt_on(p, name) for name in best), *_other_scales(p)))]
     if len(best) == 1 and not doubts:
@@ -287,8 +287,8 @@ def find_lost(p: Proposal) -> None:
     rows = dict(p.description.rows)
     for column in p.unused:
         words = {word: n for word, n in column.odd.items() if word.lower() not in LOST}
-        n_odd = sum(column.odd.values())
-        if words and not column.fixed and n_odd <= SPARSE * column.counts.total():
+        most = SPARSE * column.counts.total()
+        if words and not column.fixed and sum(column.odd.values()) <= most:
             rows[column.name] = RowWords((UNKNOWN,))
             text = f"numbers, and {counts_of(words)}: state which to drop, or keep=* if none"
             p.notes[f"rows.{column.name}.keep"] = text
@@ -309,9 +309,8 @@ def find_lost(p: Proposal) -> None:
     set_rows(p, rows)
     p.put("text.missing", sorted(missing))
     if strange:
-        lost = [*sorted(missing), *strange]
-        text = f"do these mean a lost sample? {counts_of(strange)}; if so state {lost}"
-        p.put("text.missing", UNKNOWN, text)
+        text = f"do these mean a lost sample? {counts_of(strange)}; if so state "
+        p.put("text.missing", UNKNOWN, text + str([*sorted(missing), *strange]))
 
 
 def propose_lengths(p: Proposal) -> None:
@@ -323,8 +322,8 @@ def propose_lengths(p: Proposal) -> None:
     `traces.samples` stays. Unless it is stated, another note counts the recordings that end with
     two zeros or more, if they are more than 10 %: these may fill up shorter ones.
     """
-    for channel in [*p.description.channels][:1]:
-        column = p.columns[channel]
+    if p.description.channels:
+        column = p.columns[next(iter(p.description.channels))]
         lengths = [len(words) for words in column.words if len(words)]
         usual = int(np.median(lengths or 0))
         others = [n for n in lengths if n != usual]

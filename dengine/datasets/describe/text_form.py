@@ -18,8 +18,8 @@ from ...errors import DataError, listed
 from ..dataset import Fault
 from ..description import UNKNOWN, TextForm
 from ..read.files import caught, natural_key
-from ..read.text import BLANK, COMMENT, LATIN, header_names, split_line, to_utf8
-from ..table import UnreadableError, pattern_of
+from ..read.text import BLANK, COMMENT, LATIN, header_names, split_line, to_utf8, to_utf8_or_latin
+from ..table import pattern_of
 from ..units import is_unit
 from .columns import LEAST_RUN, MOST_WORDS, NUMBER, Proposal, Stated
 
@@ -90,12 +90,10 @@ def decode(content: bytes, stated: str) -> tuple[str, str]:
     a stated encoding that Python does not know.
     """
     is_wide = content[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
-    encoding = stated or ("utf-16" if is_wide else "utf-8")
-    try:
-        text = to_utf8(content, encoding)
-    except UnreadableError:
-        encoding = stated or LATIN
-        text = to_utf8(content, encoding)
+    if stated:
+        encoding, text = stated, to_utf8(content, stated)
+    else:
+        encoding, text = to_utf8_or_latin(content, "utf-16" if is_wide else "utf-8")
     return encoding, text.decode()[:MOST_BYTES]
 
 

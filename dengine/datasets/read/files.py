@@ -58,9 +58,8 @@ def match_files(root: Path, patterns: Sequence[str]) -> set[str]:
     with instead(
         DataError, f"Expected patterns below a folder in files and exclude, got {patterns}", *BAD
     ):
-        found = (root.glob(f"{p}/*" if p.endswith("**") else p) for p in patterns)
-        paths = [*chain(*found)]
-    return {path.relative_to(root).as_posix() for path in paths if path.is_file()}
+        files = chain(*(root.glob(f"{p}/*" if p.endswith("**") else p) for p in patterns))
+        return {path.relative_to(root).as_posix() for path in files if path.is_file()}
 
 
 def find_files(root: Path, description: Description) -> list[str]:

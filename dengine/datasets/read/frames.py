@@ -106,12 +106,11 @@ def _turned(value: Any) -> Mapping[Any, Any] | None:
     first = value[0] if isinstance(value, ITEMS) and len(value) else None
     if isinstance(first, Mapping):
         columns = {key: [item[key] for item in value] for key in first}
-        lists = [cells[0] for cells in columns.values() if isinstance(cells[0], ITEMS)]
-        has_curve = max(map(len, lists), default=0) > len(value)
-        for cells in columns.values() if has_curve else ():
-            if {*map(type, cells)} == {str} and len({*cells}) == len(cells):
-                return dict(zip(cells, value, strict=True))
-        return columns
+        n_samples = [len(cells[0]) for cells in columns.values() if isinstance(cells[0], ITEMS)]
+        texts = [cells for cells in columns.values() if {*map(type, cells)} == {str}]
+        names = [cells for cells in texts if len({*cells}) == len(value)]
+        is_named = names and max(n_samples, default=0) > len(value)
+        return dict(zip(names[0], value, strict=True)) if is_named else columns
     if not isinstance(first, ITEMS):
         return None
     x = np.array(value, dtype=object)

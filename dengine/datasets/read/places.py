@@ -15,7 +15,7 @@ from ..description import LabelSource, PartSource, TextForm
 from ..table import Table, UnreadableError
 from .files import natural_key, read_file
 from .frames import read_parquet
-from .text import LATIN, read_text, to_utf8
+from .text import read_text, to_utf8_or_latin
 
 DELIMITERS = (",", ";", "\t", "|")
 SUFFIX = re.compile(r"\.[A-Za-z]\w{0,7}(\.gz)?$")  # of a file
@@ -125,15 +125,10 @@ def listing_table(path: Path, form: TextForm) -> Table:
     content = read_file(path)
     if path.suffix.lower() == ".parquet":
         return read_parquet(content, path.name)
-    encoding = form.encoding
-    try:
-        text = to_utf8(content, encoding)
-    except UnreadableError:
-        encoding = LATIN
-        text = to_utf8(content, encoding)
+    _, text = to_utf8_or_latin(content, form.encoding)
     header = text.decode().partition("\n")[0]
-    plain = TextForm(encoding, max(DELIMITERS, key=header.count))
-    return read_text(content, path.name, plain).whole()
+    plain = TextForm(delimiter=max(DELIMITERS, key=header.count))
+    return read_text(text, path.name, plain).whole()
 
 
 @contextmanager
