@@ -90,7 +90,8 @@ class RowWords:
     def kinds(self, words: Iterable[str]) -> list[str]:
         """Return what each word means, "keep", "drop" or "invalid"; "" if that is not stated.
 
-        Of several meanings the first of these counts.
+        Of several meanings the first of these counts. A word that is not stated means what `*`
+        does, if that is stated.
         """
         kinds = {word: k for k in ("invalid", "drop", "keep") for word in getattr(self, k)}
         return [kinds.get(word, kinds.get(ANY, "")) for word in words]

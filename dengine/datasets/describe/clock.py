@@ -100,12 +100,12 @@ def is_clock(column: Column) -> bool:
 
 
 def is_counter(column: Column) -> bool:
-    """Return whether numbers may count the samples, or tell the time, under a name of no clock.
+    """Return whether a column that is not named like a clock may count samples or tell the time.
 
-    They do in a column that is named like a counter (`index`, `sample`, `n`, ...) if the steps are
-    unequal, and in any other if they are equal, within 1 %, but not 0 or 1. Of the others, one like
-    `x*`, the samples of a wide table, is none, nor is one that is named like a force or has a unit
-    of another quantity.
+    `Column.steps` decides. A column that is named like a counter (`index`, `sample`, `n`, ...) may
+    if its steps differ by more than 1 %. Any other may if they are equal, within 1 %, but not 0 or
+    1, unless it is named like a force, has a unit of a quantity that is not time, or is named like
+    `x*`, the samples of a wide table.
     """
     steps = column.steps
     usual = float(np.median(steps)) if len(steps) else 0.0

@@ -124,9 +124,9 @@ class Column:
 
     @cached_property
     def usual_step(self) -> float:
-        """The median of `steps` without those of 0, and without sign; 0 if there is none.
+        """The median size of the `steps` that are not 0; 0 if there is none, NaN if one is NaN.
 
-        Times fall if the newest row is the first.
+        The sign is ignored, since times fall if the newest row is the first.
         """
         return float(np.median(np.abs(self.steps[self.steps != 0]))) if self.steps.any() else 0.0
 

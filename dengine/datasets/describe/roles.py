@@ -151,13 +151,13 @@ def qualify_rows(p: Proposal) -> None:
 def qualifies(column: Column, n_rows: int) -> bool:
     """Return whether the words of a column may tell which rows are samples.
 
-    It must have a cell in each of the `n_rows` rows of all recordings, or one for each recording,
-    and at most 12 different words, unless it is named like a status and has texts. The words must
-    change within a recording, or one of several must name a force or a torque. A column that is
-    named like a status (`Status`, `valid`) may have numbers, and also just one word in all. Any
-    other must have texts, or empty cells if it is named like a verdict, and no name like a clock. A
-    column that is named like a verdict and has one word in all, which is known to mean good or bad,
-    holds labels instead, and gives False.
+    It must have a cell in each of the `n_rows` rows of all recordings, or one for each recording
+    that has it, and at most 12 different words, unless it is named like a status and has a text
+    that is not in `LOST`. The words must change within a recording, or one of several must name a
+    force or a torque. A column that is named like a status (`Status`, `valid`) may have numbers,
+    and also just one word in all; but if it is named like a verdict, too, and this word is known to
+    mean good or bad, it holds labels. Any other column must have texts, or empty cells if it is
+    named like a verdict, and must not be named like a clock.
     """
     words = column.counts
     is_named = QUALIFIER_NAME.search(column.name) is not None
@@ -177,10 +177,10 @@ def qualifies(column: Column, n_rows: int) -> bool:
 
 
 def sources_named(p: Proposal, column: re.Pattern[str], line: re.Pattern[str]) -> list[PartSource]:
-    """Return the columns without a role and the lines above the header whose names are like these.
+    """Return the columns without a role and the lines above the header that match by name.
 
-    `column` is searched in the names of columns, and `line` in those of lines of the first table.
-    Raises SettingError for a malformed `windows.trigger`.
+    `column` is searched in the names of columns, and `line` in the beginnings of the lines of the
+    first table (`lines_of`). Raises SettingError for a malformed `windows.trigger`.
     """
     sources = [PartSource((c.name,)) for c in p.unused if column.search(c.name)]
     return sources + [PartSource(line=name) for name in filter(line.search, lines_of(p))]
@@ -247,7 +247,7 @@ def _doubt_on(p: Proposal, name: str) -> str:
 
 
 def _other_scales(p: Proposal) -> Iterator[str]:
-    """Yield a text for each column or line above the header by which scales of recordings differ.
+    """Yield a text for each column or line above the header that shows that scales differ.
 
     It is named like a unit, a factor or a rate, and its word is not the same in all recordings.
     Recordings in which it is missing, empty or changes are ignored. The columns are those without a
@@ -280,9 +280,10 @@ def find_lost(p: Proposal) -> None:
     more than 10 % of the cells of a channel are empty, "" is not added for it if `time.column` is
     set, even to `?`: these rows belong to another signal. `[rows]` then drops them, unless it has
     words of this channel already. It also gets each column without a role that has numbers and, in
-    up to 10 % of its cells, other words, like `Max` in a footer; `keep` is `?` there, with a note.
-    Dropped rows are left out of `p.tables` and `p.columns`. A stated `text.missing` stays, but
-    `[rows]` changes all the same. Raises SettingError for a malformed `windows.trigger`.
+    up to 10 % of its cells, other words, not all in `LOST`, like `Max` in a footer; `keep` is `?`
+    there, with a note. Dropped rows are left out of `p.tables` and `p.columns` (see `set_rows`). A
+    stated `text.missing` stays, but `[rows]` changes all the same. Raises SettingError for a
+    malformed `windows.trigger`.
     """
     rows = dict(p.description.rows)
     for column in p.unused:

@@ -91,15 +91,15 @@ def columns_of(prefix: str, value: Any) -> Columns:
 def _turned(value: Any) -> Mapping[Any, Any] | None:
     """Return a list of mappings as one mapping of lists by key, a list of lists as one by channel.
 
-    Mappings that hold lists, like `{"name": "force", "data": [...]}`, become one for each name, if
-    the texts under some key are all different, and a list is longer than there are names; the
-    first such key counts.
+    Mappings that hold lists, like `{"name": "force", "data": [...]}`, are returned unchanged by
+    name instead, if the values under some key are texts that are all different, and a list in the
+    first mapping is longer than there are mappings; the first such key has the names. Otherwise
+    keys that the first mapping lacks are left out.
 
     The shorter axis of a list of lists is the channels (of equal ones the first), which are
     numbered from 0. A NumPy array counts as a list. A mapping is returned as it is, and None for
-    any other value, also an empty list. Keys that the first mapping of a list lacks are left out.
-    Raises LookupError, TypeError or ValueError if an item lacks a key of the first, is of another
-    kind or has another length.
+    any other value, also an empty list. Raises LookupError, TypeError or ValueError if a mapping
+    lacks a key of the first, an item is of another kind, or lists in a list differ in length.
     """
     if isinstance(value, Mapping):
         return value

@@ -168,10 +168,10 @@ class LabelReader:
         Raises
         ------
         UnreadableError
-            If the column, line, match or key is missing, if a column has lists or no rows,
-            if rows of the listing have different ones, or if
-            the recording's own rows have and `source.at` is "same". If the key, a file's name, was
-            found for another path before.
+            If the column, line, match or key is missing, or a column has lists or no rows. If the
+            words differ in such lines, in rows of the listing with the key or, if `source.at` is
+            "same", in the recording's rows. If the key is not the part's number, and was found for
+            another path before.
         DataError
             If `source.path` is no regular expression with one group.
         """

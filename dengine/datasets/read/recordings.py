@@ -275,10 +275,10 @@ def parts_of(file: str | Table, description: Description, base: Path) -> Iterato
 
 
 def is_dropped(part: Table, rows: Mapping[str, RowWords]) -> bool:
-    """Return whether a part has one cell in a column of `[rows]`, whose word drops its rows.
+    """Return whether a column of `[rows]` has a single cell for a part, with a word to drop.
 
-    An example is a row of a wide table that has the samples of another signal. A column that the
-    part lacks, or a word without a stated meaning, drops nothing.
+    The whole part is then left out, like a row of a wide table that has the samples of another
+    signal. A column that the part lacks, or a word without a stated meaning, drops nothing.
     """
     for name in rows.keys() & part.columns.keys():
         cells = part.columns[name]

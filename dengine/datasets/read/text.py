@@ -101,8 +101,8 @@ def to_utf8(content: bytes, encoding: str) -> bytes:
 def to_utf8_or_latin(content: bytes, encoding: str) -> tuple[str, bytes]:
     """Return the encoding of a text, the given one or else cp1252, and its bytes as `to_utf8` does.
 
-    cp1252 is tried if the text is not in `encoding`. Raises UnreadableError if it is in neither,
-    and LookupError for an encoding that Python does not know.
+    cp1252 is tried if the text is not in `encoding`. Raises UnreadableError if it is in neither or
+    has a zero byte, and LookupError for an encoding that Python does not know.
     """
     with suppress(UnreadableError):
         return encoding, to_utf8(content, encoding)
