@@ -74,9 +74,9 @@ def as_options(text: str) -> str:
     `(--samples)`. Only the names channel, channels, fit, samples, rate_hz, unit and trigger are
     rewritten, and not after a colon. `TraceSpec(...)` around arguments is dropped, with a
     `DataEngine(trace=...)` around it, also within quotes. A value in quotes loses them unless a
-    shell needs them. A value that is neither in quotes nor made of letters, digits, `_` and points,
-    like -1, stays with its name as it was. All other text stays, also text in single quotes, which
-    messages use for data.
+    shell needs them. A value that begins neither with a quote nor with a letter, a digit, `_` or a
+    point, like -1, stays with its name as it was. All other text stays, also text in single quotes,
+    which messages use for data, unless a letter, a digit, `_` or `=` stands before the quote.
     """
 
     def to_option(match: re.Match[str]) -> str:
@@ -221,6 +221,10 @@ def instead(
 
 class StoreError(DengineError, RuntimeError):
     """A store that cannot be opened or written, is damaged, or is no store of this package."""
+
+
+class VersionError(StoreError):
+    """A version's state is not kept, damaged, or of another model; the store itself is well."""
 
 
 class NotTakenError(StoreError):

@@ -3,7 +3,7 @@ sets, exports, backups, tables and figures are read and written by them.
 
 `output_file` and `write_output` replace a file only with `force`, and never a database;
 `new_folder` refuses a folder that is not empty. `read_archive` unpacks no Python objects, and no
-more bytes than the machine can hold. `read_key` reads the secret that signs exports.
+more bytes than the machine can hold. `read_key` reads the secret key of exports or ledgers.
 """
 
 import io
@@ -41,9 +41,10 @@ MIN_KEY_BYTES = 16
 
 
 def read_key(path: FilePath, error: type[DengineError]) -> bytes:
-    """Return the secret key in a file, which signs exports, without line breaks at its end.
+    """Return the secret key in a file, without line breaks at its end.
 
-    Raises `error` if the file cannot be read, or the key has fewer than 16 bytes.
+    It signs exports, or is the key of a store's ledger. Raises `error` if the file cannot be read,
+    or the key has fewer than 16 bytes.
     """
     with instead(
         error,

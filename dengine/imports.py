@@ -10,13 +10,14 @@ from .errors import SettingError, instead, shortened
 def import_class(path: str) -> type:
     """Import the class that `path`, a text `module:Class`, names, and return it.
 
-    The module is imported, which runs its code.
+    The module is imported, which runs its code. A text `module.Class` is accepted, too.
 
     Raises
     ------
     SettingError
-        If the module cannot be imported, whatever subclass of Exception it raises, or has no class
-        of that name. A SettingError that the module raises passes unchanged.
+        If `path` has another form, or the module cannot be imported, whatever subclass of Exception
+        it raises, or has no class of that name. A SettingError that the module raises passes
+        unchanged.
     """
     with instead(
         SettingError,

@@ -221,8 +221,8 @@ class Recipe:
         recipe : str, path, Recipe or estimator
             A name in `RECIPES`, the recipes of dengine; the path of a TOML file; a Recipe, which is
             returned unchanged; or a reducer of your own, which gets the default settings:
-            `module:Class`, which is not imported here, or a scikit-learn transformer. A text is
-            first taken as a name, then as a path, then as `module:Class`.
+            `module:Class`, which is not imported here, or a scikit-learn transformer. A text or
+            path is first taken as a name, then as a path, then as `module:Class`.
 
         Raises
         ------
@@ -301,12 +301,13 @@ class Recipe:
     def to_toml(self) -> str:
         """Return the recipe as TOML, in which None is written as "none".
 
-        If `radius` or `retrain_every` is None, the reducer's class is imported, and its default is
-        written. Of a reducer given by name the recipe's `params` are written, and no defaults. A
-        reducer object is written as `module:Class` and its parameters that are not None. If a
-        parameter is no text, number or boolean, like the steps of a pipeline, or is None although
-        its default is not, or if the class is local or stands in `__main__`, the object is written
-        as "object Class", and the user must hand it in again. Raises SettingError if the class of a
+        A text "none" among the parameters is written alike, and is read back as None. If `radius`
+        or `retrain_every` is None, the reducer's class is imported, and its default is written. Of
+        a reducer given by name the recipe's `params` are written, and no defaults. A reducer object
+        is written as `module:Class` and its parameters that are not None. If a parameter is no
+        text, number or boolean, like the steps of a pipeline, or is None although its default is
+        not, or if the class is local or stands in `__main__`, the object is written as
+        "object Class", and the user must hand it in again. Raises SettingError if the class of a
         named reducer must be imported, and cannot be, or if its default is out of range.
         """
         plain = {f.name: getattr(self, f.name) for f in fields(self)}
@@ -342,8 +343,10 @@ class Recipe:
 
         The class of a named reducer is imported. If it has a parameter `random_state` or `folds`,
         that gets the seed or the recipe's `folds`; the recipe's `params` take precedence. Raises
-        SettingError if there is no such reducer, or if it does not take these `params`; what the
-        constructor of a user's class raises passes unchanged.
+        SettingError if the class cannot be imported, whatever `Exception` its module raises, or is
+        no scikit-learn transformer, if it lacks one of these `params`, or if the value of one, or
+        the seed, does not fit a reducer of dengine; what the constructor of a user's class raises
+        passes unchanged.
         """
         if not isinstance(self.reducer, str):
             return self.reducer
@@ -413,8 +416,9 @@ def _name_and_params(reducer: Any, params: Params) -> tuple[str, Params]:
 def describe_estimator(estimator: Any) -> str:
     """Return an estimator as text: its class and all parameters, also nested ones, sorted by name.
 
-    It looks like `MyReducer(kind='a', width=3)`. If a value is no boolean, number, text or None,
-    only its class is named, so that the text is the same in every process.
+    It looks like `MyReducer(kind='a', width=3)`. Of a value that is no boolean, number, text or
+    None only the value's class is named, like `steps: list`, so that the text is the same in every
+    process.
     """
     values = (
         f"{name}={value!r}"

@@ -16,9 +16,8 @@ def to_jsonable(value: Any) -> Any:
     numbers Python's, and NaN and infinities None. Any other object, a set or a class for example,
     becomes the text that `str` gives. All of this is done at any depth; `value` is not changed.
     Passwords are masked in all texts but keys. A dataclass field whose `metadata` has "apart" is
-    left out (large arrays have it). If it has "flat", the fields of its value, which must be a
-    dataclass or a mapping, stand in its place; TypeError if it is neither, and ValueError for a
-    text.
+    left out (large arrays have it). If it has "flat", the fields of its value stand in its place;
+    a value that is no dataclass or mapping raises TypeError or ValueError.
     """
     # Floats first: a server's responses consist mostly of them.
     if isinstance(value, float):

@@ -142,7 +142,7 @@ def labels_come_only_where_it_says_that_it_uses_them(reducer: Any) -> None:
     A transformer that is no `Reducer` must have scikit-learn's tag `target_tags.required` instead.
     Otherwise an engine would pass no labels, and every retrain would fail. A clone is trained on
     test traces, so `reducer` stays unchanged. If this fails although the reducer declares labels,
-    or fails with labels as well, the error of the training passes unchanged.
+    or fails with labels as well, the error of the training is raised unchanged.
     """
     X, y = toy_traces()
     try:
@@ -192,7 +192,7 @@ def a_trace_with_a_nan_is_refused(reducer: Any) -> None:
     """Assert that `fit` and `transform` raise ValueError for a trace with a NaN.
 
     `fit` is called on an unfitted clone, `transform` on a clone that was trained on test traces, so
-    `reducer` may be unfitted and stays unchanged. An error of another type passes unchanged.
+    `reducer` may be unfitted and stays unchanged. An error of another type is raised unchanged.
     """
     X, y = toy_traces()
     X[3, 0, 7] = np.nan
@@ -207,18 +207,18 @@ def a_trace_with_a_nan_is_refused(reducer: Any) -> None:
 
 
 def a_version_answers_as_it_was_trained(reducer: Any) -> None:
-    """Assert what an engine requires of a version: restored or compiled, it embeds as when trained.
+    """Assert that a version, a trained model, embeds equally when it is restored or compiled.
 
     Two models with clones of `reducer` are trained from scratch on test traces, the second with
     opposite labels. As in a retrain, the module that decides for the second may be a copy of the
     one that was compiled for the first, with weights of its own. The reference points must be
     finite. For eight of the traces, a reducer that is restored from the trained one's state, or
     without a state the trained one itself, must give the same points again, two times, within 1e-5
-    times (1 + the coordinate's absolute value). So must the model's decider, for each trace alone
-    as in a cell, unless it finds a fault in the trace: within 1e-3 in place of 1e-5, after points
-    are divided by the scale of their space. It runs the reducer's `module()`, compiled to
-    TorchScript, or `embed` if that is None. If the module does not compile or run, TorchScript's
-    own error is raised. `reducer` may be unfitted and stays unchanged.
+    times (1 + the coordinate's absolute value). So must the decider, by which an engine decides,
+    for each trace alone, unless it finds a fault in the trace: within 1e-3 in place of 1e-5, after
+    points are divided by the scale of their space. The decider runs the reducer's `module()`,
+    compiled to TorchScript, or `embed` if that is None. If the module does not compile or run,
+    TorchScript's own error is raised. `reducer` may be unfitted and stays unchanged.
     """
     X, y = toy_traces()
     for labels in (y, 1 - y):
@@ -231,10 +231,11 @@ def an_engine_resumes_with_identical_decisions(reducer: Any) -> None:
     """Assert that an engine that is closed and opened again decides the same, bit for bit.
 
     It runs 90 cycles on test traces, with a clone of `reducer` and a store in a temporary folder.
-    Its first retrain must be accepted. Its decisions on 20 further traces, made before the closing
-    and again after it, must be equal but for their ids. So a reducer whose `get_state` returns
-    arrays must be restored from them exactly. `reducer` may be unfitted and stays unchanged. The
-    engine limits this thread to one torch thread.
+    Its first retrain must be accepted; if there is none, since `min_traces` of the reducer is above
+    90, IndexError is raised. Its decisions on 20 further traces, made before the closing and again
+    after it, must be equal but for their ids. So a reducer whose `get_state` returns arrays must be
+    restored from them exactly. `reducer` may be unfitted and stays unchanged. The engine limits
+    this thread to one torch thread.
     """
     X, y = toy_traces(110)
     recipe = Recipe(clone(reducer), policy=Policy(0.2, 0.8), retrain_every=70, folds=FOLDS)
@@ -275,7 +276,7 @@ def check_reducer(reducer: Any) -> None:
     ------
     AssertionError
         For the first check that fails; the message names it. It is raised as well if TorchScript
-        compiles the reducer's module and cannot run it. Any other error passes unchanged.
+        compiles the reducer's module and cannot run it. Any other error is raised unchanged.
     """
     for check in REDUCER_CHECKS:
         try:
@@ -294,8 +295,10 @@ def _train_clone(reducer: Any, times: int = 1, labels: Ints | None = None) -> Re
 
     It is trained like in an engine: the fold of a trace follows from its content. There are as many
     folds as embedding spaces. A transformer that uses labels and has but one space is cross-fitted
-    in 2 folds, so it has two. Each training takes at most 8 optimiser steps. `reducer` stays
-    unchanged. `labels`, shape (100,), replace those of the traces; None keeps them.
+    in 2 folds, so it has two. A transformer that is no `Reducer` comes in the wrapper that
+    `as_reducer` chooses. Each training gets a `StopRule` of 8 steps, which a `train` without steps
+    ignores. `reducer` stays unchanged. `labels`, shape (100,), replace those of the traces; None
+    keeps them.
     """
     X, y = toy_traces()
     trained = as_reducer(clone(reducer), FOLDS)

@@ -156,7 +156,7 @@ def can_fit_length(length: int, samples: int, fit: int) -> bool:
 
 
 def _as_real(values: ArrayLike) -> TraceArray:
-    """Convert numbers or booleans to a float32 array; one that is float32 already is not copied.
+    """Convert numbers or booleans to a float32 array; a float32 array is returned as it is.
 
     A value too large for float32 becomes an infinity. Raises TraceError for values that are no real
     numbers and for rows of different lengths.
@@ -181,8 +181,8 @@ def _with_channels(values: ArrayLike, ndim: int, wanted: str) -> TraceArray:
     """Convert values to float32 as `_as_real` does, with an axis of channels before the samples.
 
     The result has `ndim` axes; if only the axis of channels is missing, there is one channel.
-    Raises TraceError, which expects `wanted`, for another number of axes, and for no channel or
-    sample.
+    Raises TraceError, whose message says that `wanted` was expected, for another number of axes,
+    and for no channel or sample. Raises TraceError as `_as_real` does, too.
     """
     x = _as_real(values)
     if x.ndim == ndim - 1:
@@ -234,10 +234,10 @@ def clip_extremes(traces: TraceArray) -> TraceArray:
     -------
     array of float32, shape (n, C, T)
         The same array if nothing was clipped or n is 0, else a copy. Each channel has its own limit
-        for the absolute value of a sample. A trace's greatest absolute value is its peak; the limit
-        is the least power of four that is at least 64 times the peak which nine in ten traces do
-        not exceed, but at most 1e15, so that float32 can sum squares. If that peak is 0, it is
-        1e15.
+        for the absolute value of a sample. The peak of a trace is the greatest absolute value in
+        the channel. The limit is the least power of four that is at least 64 times the 90 %
+        quantile of the peaks (of the two nearest peaks the lower), but at most 1e15, so that
+        float32 can sum squares. If that quantile is 0, the limit is 1e15.
     """
     if not len(traces):
         return traces

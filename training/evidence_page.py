@@ -59,20 +59,25 @@ GUARANTEES: dict[str, dict[str, Any]] = {
 HINDSIGHT = ("hindsight, scores of each moment", "hindsight, final scores")
 # Variants of conv, each with something that the paper's rule does not promise or need.
 VARIANTS = {
-    "conv, no novelty": "without the novelty gate, so it also decides on a trace unlike all others",
+    "conv, no novelty": (
+        "without the novelty gate, so it also decides on a trace that is unlike all labelled traces"
+    ),
     "conv, every stop known": (
         'with `stops="all"`: the engine counts an accepted part as good if the line did not stop'
     ),
     "conv, every stop known, dishonest": (
-        "as before, but each copy of the network learns from all labels, and the same labels are "
-        "then counted in its space; it shows what honest counting costs, and must not be used"
+        'also with `stops="all"`, but each copy of the network learns from all labels, and the '
+        "same labels are then counted in its space; it shows what honest counting costs, and must "
+        "not be used"
     ),
     "conv, pooled": 'with `guarantee="pooled"` and `stops="all"`',
     "conv, pooled, 2 % audits": (
-        "as before, and 2 % of the parts that the model is certain of are checked all the same"
+        "like *conv, pooled*, but 2 % of the parts that the model is certain of are checked all "
+        "the same"
     ),
     "conv, pooled, 10 % audits": (
-        "as before, and 10 % of the parts that the model is certain of are checked all the same"
+        "like *conv, pooled*, but 10 % of the parts that the model is certain of are checked all "
+        "the same"
     ),
 }
 
@@ -110,7 +115,8 @@ MEASURES = {
         "Bad parts accepted",
         1,
         "Parts per replay that were accepted and were bad. Fewer is better. A method that decides "
-        "little also accepts few bad parts, so read this table beside the first one.",
+        "little also accepts few bad parts, so read this table beside that of the certain "
+        "decisions.",
         False,
     ),
     "net_s": Measure(
@@ -330,16 +336,19 @@ def introduction_lines() -> list[str]:
         "[replays.csv](replays.csv) has one row per replay, and [differences.csv](differences.csv) "
         "has the means and the paired differences.",
         "",
-        "**A replay** sends the parts of one set through an engine, one after the other. The "
+        "**A replay** sends the parts of one "
+        "[set](../explanation/reducers.md#what-each-reducer-gives) through an engine, one after "
+        "the other. The "
         "engine starts without a label. It either decides a part itself, which is a *certain* "
         "decision, or has it checked and learns from the result. From an accepted part it learns "
         "only if the part stopped the line. The seed sets the order of the parts of a recorded "
-        "set. For a generated set, the seed generates the parts.",
+        "set. The parts of a generated set are generated from the seed.",
         "",
         "**The methods.** " + ", ".join(f"`{method}`" for method in REDUCERS) + " are reducers of "
-        f"dengine. The others are published methods in the same loop: {baselines}. The published "
-        "methods have rules of their own. SGR (selection with guaranteed risk) chooses a threshold "
-        "of the predicted probability. `knn` decides if all k nearest labelled parts have the same "
+        "dengine. The other names are published methods, which decide and learn in the same "
+        f"engine: {baselines}. The published methods have rules of their own. SGR (selection with "
+        "guaranteed risk) chooses a threshold of the predicted probability. `knn` decides if all k "
+        "nearest labelled parts have the same "
         "label. It has no bound at all: alpha and LB do not change its decisions.",
         "",
         "**The policies.** alpha is the error level of the interval around the success rate of "
@@ -469,7 +478,7 @@ def figure_lines() -> list[str]:
         "",
         f"![Net seconds of each method beyond those of {REFERENCE}](net_seconds.png)",
         "",
-        f"The figure shows the differences of the third table, at {policy}. The dotted line is "
+        f"The figure shows the differences in net seconds saved, at {policy}. The dotted line is "
         f"`{REFERENCE}`. If the bar of a method crosses this line, these replays show no "
         f"difference from `{REFERENCE}`.",
         "",
@@ -510,7 +519,8 @@ def paper_lines(replays: pd.DataFrame) -> list[str]:
         "",
         "The tables have the paper's 18 combinations of interval, alpha and LB on `insertion`. An "
         "entry is: bad parts accepted / certain decisions, each a mean ± the standard deviation "
-        "over the seeds. In brackets are the numbers that the paper published for its own parts.",
+        "over the seeds. In brackets are the numbers that the paper published for UMAP on its own "
+        "parts.",
         "",
     ]
     for reducer, interval in product(PAPER_REDUCERS, INTERVALS):
@@ -519,8 +529,9 @@ def paper_lines(replays: pd.DataFrame) -> list[str]:
             lines += [f"**{reducer}, {interval} interval**", ""]
             lines += [paper_table(played, reducer, interval), ""]
     lines += [
-        "Each line names a finding of the paper, and says whether these replays confirm it. In "
-        "this list, a *cell* is a cell of the tables, that is a combination of alpha and LB.",
+        "Each line says whether these replays confirm a finding of the paper. Then come the "
+        "finding, the method and what was measured. A *cell* is here a cell of the tables, that "
+        "is a combination of alpha and LB.",
         "",
     ]
     return [*lines, *(f"- {line}" for line in findings(rows)), ""]
@@ -571,10 +582,11 @@ def guarantee_lines(played: pd.DataFrame) -> list[str]:
         "The table shows `conv` if every bad accepted part stops the line and is known "
         '(`stops="all"`). `python training/evidence_guarantees.py` played its replays at commit '
         f"{commits}. {origin} An entry is: **net seconds** / certain decisions / share of the "
-        "accepted parts that were bad. The two columns on the right are limits that no engine can "
-        "reach. For them we chose afterwards, with all labels known, the accept threshold and the "
-        "reject threshold that save most. The first of the two columns applies the thresholds to "
-        "the score that each part had when it was decided (under `cost`). The second column "
+        "accepted parts that were bad. At LB 95.8 %, that is 1 - 5 / 120, an accepted part costs "
+        "as much as its check. The two columns on the right are limits that no engine can reach: "
+        "the accept threshold and the reject threshold that save most were chosen afterwards, with "
+        "all labels known. The first of the two columns applies the thresholds to the score that "
+        "each part had when the guarantee `cost` decided on it. The second column "
         "applies them to the scores of a model that was trained beforehand on the whole set, with "
         "cross-fitting: a copy of the model that was trained without the label of a part scores "
         "this part. [guarantees.csv](guarantees.csv) has a row for each replay.",

@@ -60,11 +60,12 @@ def data(
 
     DATA is a folder of files, one for each insertion, or a file with many: text, Parquet, JSON,
     .npz, .ts or .mcap. The subcommand shows the saved description or, without one, a proposal, in
-    which ? marks what you have to state with --set. While a ? is left, no recording is read, no
-    picture is drawn, and --check ends with exit code 1; --save writes the description all the same.
-    Below, it shows what was read by the description. --out draws the traces, and how they drift.
-    Look at them, and write the description with --save, because every other subcommand needs it to
-    read the recordings; it replaces another description only with --force.
+    which ? marks what you have to state with --set. While a ? is left, no recording is read by the
+    description, no picture is drawn, and --check ends with exit code 1; --save writes the
+    description all the same. Below, it shows what was read by the description. --out draws the
+    traces, and how they drift. Look at them, and write the description with --save, because every
+    other subcommand needs it to read the recordings; it replaces a file that exists only with
+    --force.
 
     DATA may also be a source that needs no description: a bundled set, the file of a store, or an
     .npz file with X (traces, samples) and y (1 success, 0 failure). For such a source --save does
@@ -136,7 +137,7 @@ def _print_open_keys(source: DataChoice, description: "Description", path: Path 
 
 
 def _survey_parts(dataset: "Dataset", survey: "Survey") -> Iterator[Any]:
-    """Yield what `dengine data` prints of a data set and its survey: tables, and sentences.
+    """Yield what `dengine data` prints of a data set and its survey: a table, and texts.
 
     These are the survey's counts with the first and last trace, the notes of the data set, a
     sentence if the order of recording is unknown, one if more than 25 of the newest usable traces
@@ -213,10 +214,10 @@ def _trace_line(dataset: "Dataset", i: int) -> str:
 def simulate(n: int, out: Path, scenario: str, seed: int, n_jobs: int, force: bool) -> None:
     """Simulate insertions and write their forces and labels.
 
-    They go into an .npz file; one that exists is refused before the simulation, or replaced with
-    --force. The file is written at the end, so Ctrl-C leaves none or the old one. The number of
-    successes, the parts that sit correctly, is printed. MuJoCo must be installed, which the extra
-    sim does; without it the exit code is 1.
+    They go into an .npz file, whose folder is made if it is missing. A file that exists is refused
+    before the simulation, or replaced with --force. The file is written at the end, so Ctrl-C
+    leaves no file, or the old file. The number of successes, the parts that sit correctly, is
+    printed. Without MuJoCo, which dengine[sim] installs, the exit code is 1.
     """
     from ..files import check_output
 
@@ -252,16 +253,19 @@ def train(
 ) -> None:
     """Import labelled traces into a store and train on them.
 
-    Each trace counts once, however often its file is imported. A bad trace (not finite, constant)
-    is stored, but never trained on. A store that has been used has its own recipe and seed: leave
-    these options out, because other values are refused. Recordings are brought to the length of the
-    store's traces. If there is a version, no label is new to it, and it lacks no training step (a
-    step of the optimizer), nothing is trained. Otherwise a version that a rollback pinned is
-    released first. If training needs more time than the recipe's time budget, several retrains
-    follow each other. The exit code is 1 if a new version is dropped, or if training steps are
-    missing at the end, because ten retrains in a row had no time for a single step. If steps are
-    missing, and after Ctrl-C, which keeps what was imported, the same command continues there. The
-    subcommand is refused while an engine runs on the cell.
+    Each trace counts once, however often its file is imported. A faulty trace (not finite,
+    constant, at the sensor's limit or too large) is stored, but never trained on. A label that
+    contradicts the stored label of its trace is left out, and counted in the output; a recording
+    that cannot be read is left out with a note. A store that has been used has its own recipe and
+    seed: leave these options out, because other values are refused. Recordings are brought to the
+    length of the store's traces. If there is a version, no label is new to it, and it lacks no
+    training step (a step of the optimizer), nothing is trained. Otherwise a version that a rollback
+    pinned is released first. If training needs more time than the recipe's time budget, several
+    retrains follow each other. The exit code is 1 if a new version is dropped (the retrain fails,
+    cannot be stored, or has no label to train on), or if training steps are missing at the end,
+    because ten retrains in a row had no time for a single step. If steps are missing, and after
+    Ctrl-C, which keeps what was imported, the same command continues there. The subcommand is
+    refused while an engine runs on the cell.
     """
     from ..datasets.importing import import_labelled, in_form_of
     from ..engine.engine import DataEngine

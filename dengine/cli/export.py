@@ -61,15 +61,16 @@ def export(
 ) -> None:
     """Write an engine's decision to a file for the controller.
 
-    FILE.sha256, the checksum, is written beside it, and with a key also FILE.sig, the signature; an
-    existing FILE is replaced only with --force, and an existing key is never replaced. --cpp writes
-    the C and C++ sources that run such a file.
+    FILE.sha256, the checksum, is written beside it, and with a key also FILE.sig, the signature. If
+    any of these three exists, --force is needed; without a key, --force removes an old FILE.sig. An
+    existing key is never replaced. --cpp writes the C and C++ sources that run such a file.
 
     STORE is the engine's store, as given to `dengine train` or `dengine run`; the cell may run
     meanwhile, and an event records the export. But the exported file never learns the outcome of a
-    part that was accepted and is still open. Before the first retrain there is nothing to export,
-    and the exit code is 1; so it is for onnx if the engine audits, has force limits, or another
-    guarantee than local with stops some. STORE needs --out, and --out needs STORE; --make-key and
+    part that was accepted and whose outcome is not known yet. Before the first retrain there is
+    nothing to export, and the exit code is 1. For onnx it is also 1 if the engine audits, is in
+    shadow mode, has force limits or another guarantee than local with stops some, or has a part
+    among its references more than once. STORE needs --out, and --out needs STORE; --make-key and
     --cpp need neither.
 
     If --make-key is given together with STORE and --out, the new key also signs FILE; so

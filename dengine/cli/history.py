@@ -103,10 +103,12 @@ def history(store: str, events: bool, **criteria: Any) -> None:
 
     STORE is the file or URL of an engine's store, and must exist. The options choose which
     decisions; --events adds the retrains and events since the first of these decisions (if no
-    decision fits, all), or since --since, and before --until. In the table good and bad are the
-    labels that were counted, bound is the interval of the success rate that follows from them, v is
-    the version of the model, and label is what the part turned out to be. If there is nothing to
-    list, a sentence says so. `dengine explain` tells more about one decision.
+    decision fits, all), or since --since, and before --until. In the table part has the last 10
+    characters of the part's number, model is what the model alone would have done, if that differs
+    from the action, good and bad are the labels that were counted, bound is the interval of the
+    success rate that follows from them, v is the version of the model, and label is what the part
+    turned out to be. If there is nothing to list, a sentence says so. `dengine explain` tells more
+    about one decision.
     """
     from ..history.status import history as read_history
     from ..representation import to_jsonable
@@ -133,7 +135,9 @@ def history(store: str, events: bool, **criteria: Any) -> None:
 def _label_text(stored: StoredDecision) -> str:
     """Return a decision's label, and how it became known, as text: "good verified", "bad stop".
 
-    It is "-" if there is no label, or if the label was forgotten.
+    A corrected label is shown as corrected, but with the source of the first report; only a
+    confirmed part that was corrected to bad has the source "stop". The text is "-" if there is no
+    label, or if the label was forgotten.
     """
     if stored.success is None:
         return "-"
@@ -180,9 +184,9 @@ def _history_table(items: Sequence[StoredDecision | StoredVersion | Event]) -> s
     """Return a table of decisions as text, in the order of the items.
 
     It has a row for each decision, with the columns in `COLUMNS`, from its time to its label.
-    Retrains and events are lines between its rows, cut to 119 characters; the rows are not cut. Two
-    lines of titles come first, also if no item is a decision. Without any item the text is a
-    sentence that says so.
+    Retrains and events are lines between its rows, cut to 119 characters; the rows are not cut, but
+    of a part's number they have only the last 10 characters. Two lines of titles come first, also
+    if no item is a decision. Without any item the text is a sentence that says so.
     """
     from ..store.records import StoredDecision
 

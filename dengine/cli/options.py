@@ -65,8 +65,9 @@ def names_of(kind: str) -> tuple[str, ...]:
     Parameters
     ----------
     kind : str
-        guarantee, interval, stops, recipe, method (recipes and baselines), fit (what is done with
-        live traces of another length), label, action or reason. Any other is a KeyError.
+        guarantee (the decision rule), interval, stops (which bad accepted parts stop the system),
+        recipe, method (recipes and baselines), fit (what is done with live traces of another
+        length), label, action or reason (of a decision). Any other kind is a KeyError.
     """
     from ..decision.intervals import INTERVALS
     from ..decision.policy import RULES, Stops
@@ -295,7 +296,7 @@ class RecipeChoice:
         return self.make_contender().recipe if self.name or self.settings else None
 
     def make_contender(self) -> Contender:
-        """Return who plays a replay: a `Contender`, which is a recipe or a baseline with its name.
+        """Return the `Contender` that a replay runs: a recipe or a baseline, with its name.
 
         It is what `Contender.load` returns for the name (conv if none was given), with the settings
         that were given. Its name is shortened, as `short_name` does.
@@ -463,10 +464,11 @@ class DataChoice:
         Raises
         ------
         DataError
-            If the source does not exist or is damaged, its description cannot be read or proposed,
-            or a stated key is unknown or its value has the wrong type.
+            If the description cannot be read or proposed, or a stated key is unknown or its value
+            has the wrong type. If the source does not exist or is damaged; but if a description is
+            given, the source is not looked at.
         SettingError
-            If none was saved, and a stated `windows.trigger` is malformed.
+            If none is given or saved, and a stated `windows.trigger` is malformed.
         """
         from ..datasets.loading import description_of, own_reader
 
@@ -481,14 +483,16 @@ class DataChoice:
         It has only the channels and samples that the options `--channels` and `--samples` ask for.
         `Dataset.notes`, and the first three recordings that were left out, are printed to stderr,
         but not with `--json`. `description` is the description to read by; None takes the one that
-        `describe` returns.
+        `describe` returns. A damaged trace of a store is left out, and the store gets an event on
+        it.
 
         Raises
         ------
         DataError
             If the data set cannot be read, a channel does not exist, or the traces are shorter than
-            `--samples`. Also if a description is needed and none is saved, if it has a `?`, or if a
-            stated key is unknown or its value has the wrong type.
+            `--samples`, or longer although they were resampled. Also if a description is needed and
+            none is saved, if it has a `?`, or if a stated key is unknown or its value has the wrong
+            type.
         SettingError
             If `windows.trigger` of the description is malformed.
         StoreError
@@ -514,11 +518,12 @@ class DataChoice:
 
 
 def fault_lines(data: Dataset, most: int) -> list[str]:
-    """Return lines that list the recordings of a data set that could not be read, with the reasons.
+    """Return lines that list the faults of a data set, with the reasons.
 
-    The first line counts them and all recordings, those without a label included. At most `most`
-    are named, in their order, and a last line counts the others. The list is empty if every
-    recording could be read.
+    A fault is a recording or file that could not be read by the description, or a recording that
+    repeats another one. The first line counts the faults and all recordings, those without a label
+    included. At most `most` faults are named, in their order, and a last line counts the other
+    faults. Without faults the list is empty.
     """
     n_faults = len(data.faults)
     if not n_faults:
@@ -664,11 +669,11 @@ def recorder_settings(options: Options) -> tuple[dict[str, Any], TraceSpec]:
     """Return the settings of an `RtdeRecorder`, by its argument names, and its `TraceSpec`.
 
     They come from the values of `--samples`, `--channels`, `--rate-hz`, `--unit` and `--fit` in
-    `options`, by name, as far as they were given; other options are ignored. The settings are
-    samples, rate_hz and channels, and those that were not given are left out. The `TraceSpec` has
-    the recorder's defaults for them (see `spec_of_recording`), and also the unit and the fit (what
-    is done with traces of another length). Without `--unit` the unit of a force is N, and any other
-    is unknown. Raises SettingError for values that no trace can have.
+    `options`, by the names in `TRACE`, as far as they were given; other options are ignored. The
+    settings are samples, rate_hz and channels, and those that were not given are left out. The
+    `TraceSpec` has the recorder's defaults for them (see `spec_of_recording`), and also the unit
+    and the fit (what is done with traces of another length). Without `--unit` the unit of a force
+    is N, and any other is unknown. Raises SettingError for values that no trace can have.
     """
     from ..cells.ur.recorder import spec_of_recording
 
@@ -745,7 +750,7 @@ def require_modules(purpose: str, extra: str, *modules: str) -> None:
     extra : str
         Extra of dengine that installs them.
     *modules : str
-        Names of the modules.
+        Names of the modules, without dots: for a name with a dot its package would be imported.
     """
     if missing := ", ".join(name for name in modules if find_spec(name) is None):
         raise SettingError(

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 
 Record = dict[str, Any]  # what `--json` prints, by name
 SCREEN_WIDTH = 80  # columns where no terminal says otherwise; every table fits them
+LONGEST_NAME = 40  # characters in the first column of a table that is never wrapped
 LINE_SECONDS = 30.0  # between two lines about progress where there is no terminal
 INTERRUPTED = 130  # exit code, as shells have it: 128 + SIGINT
 # The names of two flags, and the keys in click's context that hold whether they were given.
@@ -94,7 +95,9 @@ class Out:
         Parameters
         ----------
         contents : mapping of str to DataFrame or Figure
-            File name -> a table (written as CSV) or a figure. The name "" is `path` itself.
+            File name -> a table (written as CSV) or a figure, in the format of the file's suffix
+            (PNG without a suffix). The name "" is `path` itself, which is then a file; its folder
+            is made.
 
         Returns
         -------
@@ -104,8 +107,9 @@ class Out:
         Raises
         ------
         OutputError
-            A file exists and `force` is not set, it cannot be written, or no format of figures has
-            its suffix. The files before it in `contents` are written already.
+            A file exists and `force` is not set, it is a database or a link, it cannot be written,
+            or no format of figures has its suffix. The files before it in `contents` are written
+            already.
         """
         from matplotlib.figure import Figure
 
@@ -176,13 +180,13 @@ def print_result(
 def print_parts(*parts: Any) -> None:
     """Print tables and texts to stdout, the texts with the passwords of database URLs masked.
 
-    `table_of_rows` masks them in its tables. Tables and texts fit the terminal, or 80 columns if
-    there is none. A text of one line is wrapped between words, which keeps long paths whole. A text
-    of several lines is printed as it is, and "" as an empty line.
+    `table_of_rows` masks them in its tables; in other tables they stay. A table fits the terminal,
+    or 80 columns if there is none. A text of one line is wrapped to this width between words, so
+    long paths stay whole. A text of several lines is printed as it is, and "" as an empty line.
     """
     from rich.console import Console
 
-    screen = Console() if sys.stdout.isatty() else Console(width=SCREEN_WIDTH)
+    screen = Console(width=None if sys.stdout.isatty() else SCREEN_WIDTH, emoji=False)
     for part in parts:
         is_text = isinstance(part, str)
         if is_text:
@@ -197,7 +201,8 @@ def table_of_rows(
 ) -> "Table":
     """Return a rich Table whose first column is bold; passwords of database URLs are masked.
 
-    The first column is never wrapped; a cell of another column that is too wide is folded.
+    A cell that is too wide is folded; the first column only if it has a cell of more than 40
+    characters (`LONGEST_NAME`).
 
     Parameters
     ----------
@@ -208,13 +213,18 @@ def table_of_rows(
     columns : sequence of str
         Titles of the columns; if all are empty, the table has no header.
     """
+    from rich.markup import escape
     from rich.table import Table
 
-    table = Table(title=without_password(title), show_header=any(columns), title_justify="left")
+    title = escape(without_password(title))
+    table = Table(title=title, show_header=any(columns), title_justify="left")
+    cells = [[*map(without_password, row)] for row in rows]
+    is_short = all(len(row[0]) <= LONGEST_NAME for row in cells)
     for i, name in enumerate(columns):
-        table.add_column(name, style="" if i else "bold", no_wrap=not i, overflow="fold")
-    for row in rows:
-        table.add_row(*map(without_password, row))
+        no_wrap = is_short and i == 0
+        table.add_column(name, style="" if i else "bold", no_wrap=no_wrap, overflow="fold")
+    for row in cells:
+        table.add_row(*row)
     return table
 
 

@@ -83,8 +83,9 @@ def _play(
     """Play tasks, each a replay to be played, with a progress bar; return what was finished.
 
     That is the finished replays in the order of their tasks, and the error or Ctrl-C that ended the
-    work early, which is not raised: the caller must pass it to `_end`. Of `stream` the cycles, the
-    number of processes and the folder of kept replays are used.
+    work early (None if nothing did), which is not raised: the caller must pass it to `_end`. Of
+    `stream` the number of processes, the folder of kept replays and, only for the length of the
+    bar, the cycles are used.
     """
     from ..experiments.grid import iterate_replays
 
@@ -300,9 +301,10 @@ def _replay_and_print(
     document, and write the files of `out`.
 
     After Ctrl-C or an error the finished replays are shown, if there are some, and a line on stderr
-    says how many. Then the process ends with exit code 130, or the error is raised. Errors of the
-    data set, and settings out of range, are raised before anything is played. A file that cannot be
-    written is an OutputError, raised after the result was printed.
+    says how many; after an error without finished replays there is no such line. Then the process
+    ends with exit code 130, or the error is raised. Errors of the data set, and settings out of
+    range, are raised before anything is played. A file that cannot be written is an OutputError,
+    raised after the result was printed, and then in place of the error or exit code 130.
 
     Parameters
     ----------
@@ -408,8 +410,8 @@ def _replay_files(
 def _row_name(replay: Replay, frame: pd.DataFrame) -> str:
     """Return a label for a replay in figures, like "conv, alpha 0.1, LB 90 %".
 
-    It has the name of the recipe or baseline, and of guarantee, stops, interval, alpha and LB those
-    that vary in `frame`, the table of all replays.
+    It has the name of the recipe or baseline, and those of guarantee, stops, interval, alpha and
+    lower bound (LB) that vary in `frame`, the table of all replays.
     """
     policy = replay.recipe.policy
     settings = {
@@ -497,14 +499,16 @@ def costs(
     Shows what a part of your recordings costs under the best policies, and what it costs if
     everything is verified. Says how certain these costs are, and how to set the policy. If no
     policy pays or may pay, the choice is to verify everything, and the output names no policy to
-    set. The policies that are tried have the guarantees pooled and cost, or values of LB, the
-    --lower-bound, around break-even, where accepting costs as much as verifying (or those of
-    --lower-bounds); a baseline or a rule of your own is tried without pooled and cost. One value
-    (--alpha) where a list is tried (--alphas) is a usage error. All costs are in one unit, such as
-    seconds of production or money. --out writes costs.csv and costs.png. Ctrl-C, or an error in a
-    replay, ends it and shows what was finished, if at least two shuffles are finished by every
-    policy that is left. The exit code is 1 if a check costs as much as a bad accepted part or more,
-    if a false reject costs nothing, or if the recordings have one label only or are too few.
+    set. The policies that are tried have the guarantee local or pooled, each with values of LB, the
+    lower bound, around break-even, where accepting costs as much as verifying (or with those of
+    --lower-bounds), or the guarantee cost; these replace --guarantee and --prices. A baseline is
+    tried under local alone, and a rule of your own in place of all three. --alpha and --lower-bound
+    are usage errors: give --alphas and --lower-bounds. All costs are in one unit, such as seconds
+    of production or money. --out writes costs.csv and costs.png. Ctrl-C (exit code 130), or an
+    error in a replay (1), ends it and shows what was finished, if at least two shuffles are
+    finished by every policy that is left. The exit code is 1 if a check costs as much as a bad
+    accepted part or more, if a false reject costs nothing, or if the recordings have one label only
+    or are too few.
     """
     _refuse_value_beside_list(choice.settings, ("alphas", "lower_bounds"))
     from ..experiments.costs import find_policy, settings_of
@@ -612,10 +616,11 @@ def _as_flags(settings: Options) -> str:
 def _cost_cells(row: PolicyCost, is_chosen: bool) -> tuple[str, ...]:
     """Return the cells of a policy's row in the table of costs, under the titles in `COLUMNS`.
 
-    The first is ">" if the policy is chosen, else "". The others are its rule (like "alpha 0.1"
-    under the guarantee local, else the name of the guarantee), LB ("-" under cost), cost with its
-    interval in a second line, late cost (over the last third of each shuffle), share of verified
-    parts, and wrong accepts and rejects with the intervals of their shares.
+    The first is ">" if the policy is chosen, else "". The others are its rule (like "alpha 0.1" if
+    its guarantee is local, else the name of the guarantee), LB, its lower bound ("-" if its
+    guarantee is cost), cost with its interval in a second line, late cost (over the last third of
+    each shuffle), share of verified parts, and wrong accepts and rejects with the intervals of
+    their shares.
     """
     policy = row.policy
     is_local = policy.guarantee == "local"
@@ -635,7 +640,8 @@ def _error_cell(error: ErrorRate) -> str:
     """Return how many decisions were wrong, like "3 of 120", and in a second line the interval of
     their share in percent, like "0.5 to 7.1 %".
 
-    The ends have three significant digits. It is "-" if there was no decision.
+    The ends of the interval have at most three significant digits. The text is "-" if there was no
+    decision.
     """
     if not error.decided:
         return "-"

@@ -88,7 +88,7 @@ def run(
     """Drive a cell: verify, learn, and verify less.
 
     With a store that exists the engine continues where it was. If you give an option of the recipe,
-    the whole recipe must then be the store's (conv if you name none); otherwise the store's recipe
+    the whole recipe (conv, if you name no other) must be the store's; otherwise the store's recipe
     is used. The simulated cell then makes new parts, and a recording continues after its last part
     that was labelled or accepted: no part is learned from twice. It is refused if it has fewer
     parts left than --cycles. A robot runs dengine/cells/ur/ur_cell.script, or a program with the
@@ -208,10 +208,11 @@ def _simulated_cell(scenario: str, cycles: int, source: DataChoice, **others: An
     The `TraceSpec` is the simulation's own, or what the options of `source` state; rate, unit and
     names of channels that these leave out are then the simulation's, if the shape is the same. The
     function takes the engine, and returns the cell and its name. The cell's seed depends on the
-    engine's seed, on the number of decisions in the store, and in a product also on the cell, so
-    that no part comes twice. `scenario` says what changes in the course of the `cycles`; for an
-    unknown one SettingError is raised when the cell is made. `others` are settings of other kinds
-    of cell, and are ignored. Raises what `trace_spec_from` raises.
+    engine's seed, on the number of decisions in the store, and in a product (cells that share
+    labels) also on the cell, so that no part comes twice. `scenario` says what changes in the
+    course of the `cycles`; for an unknown one SettingError is raised when the cell is made.
+    `others` are settings of other kinds of cell, and are ignored. Raises what `trace_spec_from`
+    raises.
     """
     from ..cells.simulation.cell import SimulatedCell
 
@@ -238,9 +239,10 @@ def _replay_cell(source: DataChoice, cycles: int, **others: Any) -> CellToDrive:
 
     The recording is the data set of `source`, and is loaded at once. The cell begins after the last
     part that was played before. A part was played before if its trace equals one that has a label
-    of this cell in the store (but none that was forgotten or quarantined), or that of this cell's
-    newest accepted part without a report. Making the cell raises SettingError if fewer parts than
-    `cycles` are left. `others` are ignored. Raises the errors of `DataChoice.load`.
+    of this cell in the store (but no forgotten label, and no trace with a fault), or that of this
+    cell's newest accepted part without a report. Making the cell raises SettingError if fewer parts
+    than `cycles` are left, and StoreError if the store cannot be read or the trace of that accepted
+    part is damaged. `others` are ignored. Raises the errors of `DataChoice.load`.
     """
     import numpy as np
 
@@ -305,7 +307,7 @@ def _robot_cell(source: DataChoice, host: str | None, **others: Any) -> CellToDr
 
 
 def host_and_port(address: str) -> tuple[str, int]:
-    """Split HOST[:PORT] of a robot controller, and return both; without PORT it is 30004, RTDE's.
+    """Split HOST[:PORT] of a robot controller, and return both; the default of PORT is 30004.
 
     HOST may come back empty, for an `address` without one.
 
@@ -351,9 +353,10 @@ def _print_run(replay: Replay, record: Record, cell: Any, out: Out | None) -> No
     A stretch is a number of consecutive cycles. The cell's own report is shown if the cell has a
     method `report`. The sentences say how much time was saved (the checks left out, less 120 s for
     each line stop and 47.5 s for each rejected good part), how the retrains went, when safe mode
-    began and ended, and what the certificate is. The counts are added to `record`, which has the
-    rest, in place, and `--json` prints it in place of all that. run.csv and run.png are written to
-    `out`, if it is given; OutputError, if that fails, is raised after the printing.
+    began and ended, and what share of the accepted parts was bad at most (the certificate). The
+    counts are added to `record`, which has the rest, in place, and `--json` prints it in place of
+    all that. run.csv and run.png are written to `out`, if it is given; OutputError, if that fails,
+    is raised after the printing.
     """
     from ..experiments.figures import curves
     from ..experiments.metrics import Costs

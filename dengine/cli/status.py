@@ -56,10 +56,11 @@ def status(store: str, last: int, check_seconds: float) -> None:
 
     STORE is the file or URL of the engine's store, as given to `dengine train` or `dengine run`,
     and must exist. An engine may run on it meanwhile. If it holds several cells and none is named,
-    they are only listed; cells of one product share labels and versions. The interval of bad
-    accepted parts is valid if you look once; the certificate is valid however often you look. If
-    the model was certain of parts that were verified, as in shadow mode, a line says how much time
-    the model would have saved, at `--check-seconds` for each check.
+    they are only listed; cells of one product share labels and versions. A damaged label or version
+    that is read is recorded as an event. The interval of bad accepted parts is valid if you look
+    once; the certificate, which bounds their share, is valid however often you look. If the model
+    was certain of parts that were verified, like in shadow mode, a line says how much time it would
+    have saved, at `--check-seconds` for each check.
     """
     from ..history.status import status as read_status
     from ..representation import to_jsonable

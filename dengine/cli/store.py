@@ -109,12 +109,12 @@ def report(part: str, label: str, **changing: Any) -> None:
     one decision, or one that is no reject; otherwise it is refused, and so is a part that is not in
     the store. For an accepted part, bad is a line stop, and good a confirmation. For a rejected
     part the label is that of an inspection: the engine trains on it, and the rule does not learn
-    it. An event records the report. A retrain that is due then runs. The same label again changes
-    nothing. Another label than the reported one is refused with exit code 1, unless it is a line
-    stop after a confirmation, and so is any report on a forgotten label; `dengine correct` puts
-    either right. Only the newest 20 decisions on the part are looked at. The subcommand is
-    refused while an engine runs on the cell. A store that names a reducer or rule of your own,
-    module:Class, needs --allow-import.
+    it. An event records the report. A retrain that is due then runs. The label that the decision
+    has already, reported or corrected, changes nothing. Another label is refused with exit code 1,
+    unless it is a line stop after a confirmation, and so is any label after `dengine forget`;
+    `dengine correct` puts either right. Only the newest 20 decisions on the part are looked at. The
+    subcommand is refused while an engine runs on the cell. A store that names a reducer or rule of
+    your own, module:Class, needs --allow-import.
     """
     from ..engine.corrections import Changed
     from ..history.explain import find_decision_id
@@ -149,7 +149,7 @@ def correct(part: str, label: str, **changing: Any) -> None:
 
     The part is named as for `dengine report`. From now on its decision counts with the corrected
     label. The label as it was reported stays in the store, and so does the decision; the correction
-    is a later row, and an event. A correction makes a forgotten label count again. If this label
+    is a later row, and an event. A label that `dengine forget` left out counts again. If this label
     counts already, nothing changes. An unknown decision, and one without a label, is refused with
     exit code 1. The subcommand is refused while an engine runs on the cell.
     """
@@ -217,15 +217,15 @@ def policy(store: str, settings: dict[str, Any], author: str, allow_import: bool
 
     Without options it is shown, even while an engine runs on the cell; a change is refused then. A
     change is recorded as an event; settings that are in force already change nothing. A setting
-    that is not given stays as it is, but --prices alone
-    also change the guarantee local or pooled to cost, and an audit rate of 0 to 0.05. Earlier
-    decisions keep their bounds. The certificate starts again after any change. The rule also
-    forgets what it learned, after a change of --alpha, --lower-bound, --interval, --guarantee,
-    --stops or --prices, and, under pooled or cost with --stops some, of --audit-rate: a tolerance
-    that is chosen after the data was seen needs fresh evidence. A model that was handed in keeps
-    its rule, and a change of these settings other than --stops and --audit-rate is refused.
-    Shadow mode lasts over restarts; `dengine status` counts
-    what the model would have done, and how much of it was wrong.
+    that is not given stays as it is, but --prices without --guarantee also changes the guarantee
+    local or pooled to cost, and then an audit rate of 0 to 0.05, unless --audit-rate is given.
+    Earlier decisions keep their bounds. The certificate, which bounds the share of wrong decisions,
+    starts again after any change. The rule also forgets what it learned, after a change of --alpha,
+    --lower-bound, --interval, --guarantee, --stops or --prices, and, under pooled or cost with
+    --stops some, of --audit-rate: a tolerance that is chosen after the data was seen needs fresh
+    evidence. A store whose engine needs a model or reducer that was handed in as an object is
+    refused, with and without options. Shadow mode lasts over restarts; `dengine status` counts what
+    the model would have done, and how much of it was wrong.
     """
     if settings:
         _change_and_print(
@@ -251,12 +251,12 @@ def policy(store: str, settings: dict[str, Any], author: str, allow_import: bool
 def retrain(store: str, author: str, allow_import: bool) -> None:
     """Train now, on the store's labels with all corrections.
 
-    An event records it, also if the version is dropped. The new version replaces a pinned one, too;
-    a pinned version is released first, and stays released if the new version is dropped. If the
-    recipe's time budget ends before the training does, the output says how many steps are to go,
-    and the next retrain continues. If the training fails or has no label to train on, or the new
-    version fails its tests or cannot be stored, it is dropped, the previous version stays in use,
-    and the exit code is 1. The subcommand is refused while an engine runs on the cell.
+    An event records it, also if the version is dropped. A version that `dengine rollback` pinned is
+    released first, and stays released if the new version is dropped. If the recipe's time budget
+    ends before the training does, the output says how many steps are to go, and the next retrain
+    continues. If the training fails or has no label to train on, or the new version fails its tests
+    or cannot be stored, it is dropped, the previous version stays in use, and the exit code is 1.
+    The subcommand is refused while an engine runs on the cell.
     """
     from ..engine.engine import DataEngine
     from ..experiments.tables import retrain_line
@@ -309,13 +309,13 @@ def verify(
     """Check that a store's history is what was written.
 
     Every row is compared with its checksum, and every entry of the ledger, a chain of digests over
-    the rows, with its rows. The subcommand lists damage of an SQLite file, rows and settings that
-    were changed, rows that are missing or that are in no entry, damaged or missing records of a
-    journal, data that was lost, and a --expect that the history does not hold, at most 20 in all
-    (--json: each that was found). If there are any, the exit code is 1. For each cell it shows the
-    number of entries and rows, and the newest digest: keep it elsewhere for --expect. It also says
-    if a cell's journal is missing, or holds records that the store lacks; neither alone is a fault.
-    The subcommand writes rows only with
+    the rows, with its rows. The subcommand lists damage of an SQLite file, rows, settings and
+    entries that were changed, added or removed, damaged or missing records of a journal, data that
+    was lost and that nobody has acknowledged, and a --expect that the history does not hold, at
+    most 20 in all (--json: each that was found). If there are any, the exit code is 1. For each
+    cell it shows the number of entries and rows, and the newest digest: keep it elsewhere for
+    --expect. It also says if a cell's journal is missing or cannot be read, or holds records that
+    the store lacks; none of these alone is a fault. The subcommand writes rows only with
     --acknowledge, after which it checks again (an SQLite file is set to WAL mode if it is not).
     Engines may run meanwhile.
     """
@@ -338,9 +338,10 @@ def verify(
 def _verification_lines(report: HistoryReport) -> list[str]:
     """Return the lines that say what a check of a store's history found.
 
-    For each cell they say how many entries and rows it has, its newest digest, and that its journal
-    is missing or holds records, if so. Then come the differences that it found (`report.faults`),
-    at most 20, how many more there are, and whether everything is as it was written.
+    For each cell they say how many entries and rows it has, its newest digest, and, if so, that its
+    journal is not here (this is also said of one that cannot be read) or holds records. Then come
+    the differences that it found (`report.faults`), at most 20, how many more there are, and
+    whether everything is as it was written.
     """
     lines = []
     for cell in report.cells:
@@ -392,8 +393,9 @@ def backup(store: str, out: Path) -> None:
     store, which a plain copy of the file lacks. It can be opened, and checked by `dengine verify`,
     wherever it is. Damaged records of a journal are left out, and a record that contradicts the
     store becomes an event of kind "dead letter" in the copy. Cells without a journal are named. A
-    store in PostgreSQL is refused (pg_dump copies it), and so are an --out that exists and a
-    journal that cannot be read.
+    store in PostgreSQL is refused (pg_dump copies it), and so are an --out that exists, a journal
+    that cannot be read, and one with records, if the cell's ledger has another key than the file
+    that DENGINE_LEDGER_KEY names.
     """
     from ..store.backup import backup_store
 
@@ -422,14 +424,14 @@ def backup(store: str, out: Path) -> None:
 def restore(copy: str, store: Path) -> None:
     """Put a backup in the place of a store.
 
-    COPY is what `dengine backup` wrote, on this or another machine. It is checked first; if it is
-    not as it was written, its ledger has another key than the file that DENGINE_LEDGER_KEY names,
-    or --store exists, it is refused with exit code 1. Beside --store each cell gets a journal. It
-    names the newest entry of the cell's ledger, by which the next engine sees that the store is
-    complete. A journal that is there already stays, and that engine takes from it what the copy
-    lacks; if the journal names entries that the copy lacks, it raises an alarm. Records of journals
-    beside COPY are added to the store. If a journal cannot be made, the exit code is 1, and the
-    store stays.
+    COPY is what `dengine backup` wrote, on this or another machine. It is checked first; if
+    `dengine verify` would find a fault in it, even lost data alone that nobody has acknowledged, if
+    its ledger has another key than the file that DENGINE_LEDGER_KEY names, or if --store exists, it
+    is refused with exit code 1. Beside --store each cell gets a journal. It names the newest entry
+    of the cell's ledger, by which the next engine sees that the store is complete. A journal that
+    is there already stays, and that engine takes from it what the copy lacks; if the journal names
+    entries that the copy lacks, it raises an alarm. Records of journals beside COPY are added to
+    the store. If a journal cannot be made, the exit code is 1, and the store stays.
     """
     from ..store.backup import restore_store
 
@@ -452,7 +454,7 @@ def restore(copy: str, store: Path) -> None:
     help="Accept a journal of a model that is not recorded as an export of this store.",
 )
 def import_labels(journal: Path, store: str, any_model: bool) -> None:
-    """Import the labels of a cell program into the store.
+    """Import the labels of an exported model's program.
 
     JOURNAL is the CSV file that the program wrote. Each line counts once, however often it is
     imported; a label that contradicts the store's is counted, but not stored. Under the policy

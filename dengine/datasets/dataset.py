@@ -152,8 +152,8 @@ class Dataset:
         """The `TraceSpec` of live traces of the same shape, for `DataEngine(trace=data.spec)`.
 
         A rate or a unit that is unknown is None; its `columns` are the names of the channels.
-        Raises SettingError if the fields of the data set are none that traces can have, like two
-        equal names of channels.
+        Raises SettingError if a field of the data set has a value that no trace can have, for
+        example if two channels have the same name.
         """
         _, channels, samples = self.cube.shape
         return TraceSpec(
@@ -187,8 +187,8 @@ class Dataset:
 
         Its X is a copy, for one channel of shape (n, T). `channels` and `unit` become those of the
         selected channels; all other fields stay. Raises DataError for an unknown name, for no name,
-        and if the channels of the data set have no names, and SettingError where `spec` does. A
-        name that comes twice passes, but `spec` of the result then raises SettingError.
+        and if the channels of the data set have no names, and SettingError if `spec` raises it. A
+        name that comes twice is accepted, but `spec` of the result then raises SettingError.
         """
         names = ", ".join(self.channels) or "none, its channels have no names"
         is_known = set() < {*channels} <= {*self.channels}

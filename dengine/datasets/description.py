@@ -324,8 +324,8 @@ class Description:
         and `[ignored]`. Of a channel, a text in place of a dict is its unit. A single value may
         stand for a list of one, and a number or boolean for a text. `notes` are no key; the result
         has none. Raises DataError for an unknown key or choice (the message names the most similar
-        key, or else all), for a value of the wrong type, and for a description of a newer version
-        or one that is no integer.
+        key, or else all), for a value of the wrong type, for NaN or infinity in a key of floats,
+        and for a version that is newer or no integer.
 
         where : what the description is called in errors.
         """
@@ -347,8 +347,8 @@ class Description:
     def load(cls, path: FilePath) -> "Description":
         """Read a description from a TOML file.
 
-        Raises DataError if the file cannot be read, has more than 1 MB or is no TOML, and
-        where `from_dict` does. Comments are not read; the result has no `notes`.
+        Raises DataError if the file cannot be read, has more than 1 MB or is no TOML, and as
+        `from_dict` does. Comments are not read; the result has no `notes`.
         """
         with instead(
             DataError, f"Expected a description in {path}", OSError, ValueError, TypeError
@@ -443,8 +443,8 @@ class Description:
         stay. Stating a channel replaces the channel `?`. In `rows.NAME.keep`, `channels.NAME.unit`
         and keys like these (`OF_COLUMN`) the name of a column may have dots; any other key is split
         at its first dot. A key without a dot may be a whole section, which its value then replaces.
-        The notes stay. Raises DataError where `from_dict` does, and if what stands before the dot
-        in a key is no section.
+        The notes stay. Raises DataError as `from_dict` does, if what stands before the dot in a key
+        is no section, and for a key like `check.column` if there is a `[[check]]` already.
         """
         values = self.to_dict()
         for section in ("label", "part"):
@@ -506,8 +506,8 @@ def _made(kind: Any, value: Any, where: str) -> Any:
     """Return a value of a TOML file, converted to `kind`, the annotated type of its key.
 
     A table becomes a dataclass or a dict, and a list a tuple; so does a single value if several are
-    expected. `?` may stand in place of a text, number, boolean or choice, and of a mapping its key
-    `?` is left out. A single value in place of a `Channel` is its unit. Raises DataError for an
+    expected. `?` may stand in place of a text, number, boolean or choice, and the key `?` of a
+    mapping is left out. A single value in place of a `Channel` is its unit. Raises DataError for an
     unknown key or choice, and for a value of another type (see `_as_kind`); `where` is its name in
     the message.
     """
@@ -541,9 +541,9 @@ def _as_kind(kind: Any, value: Any, where: str) -> Any:
 
     `kind` is a type in `KINDS`: text, whole number, number, boolean, or whole number or text. A
     number or boolean becomes a text, as Python writes it (`True`, `nan`), if only a text is
-    expected, and a whole number a float if a number is. Raises DataError for a value of another
-    type; and, if a number is expected, for one that is not finite or too large for a float. `where`
-    is the name of the key in the message.
+    expected, and a whole number becomes a float if a number is expected. Raises DataError for a
+    value of another type; and, if a number is expected, for one that is not finite or too large for
+    a float. `where` is the name of the key in the message.
     """
     if value == UNKNOWN:
         return value
@@ -589,7 +589,7 @@ def flat(prefix: str, value: Mapping[str, Any]) -> dict[str, Any]:
 
     An empty mapping within it is left out. If two keys become equal, the later one counts.
 
-    prefix : text that is put before each key as it is, without a dot. value : the mapping.
+    prefix : text that is put before each key; no dot is added. value : the mapping.
     """
     items: dict[str, Any] = {}
     for name, item in value.items():
@@ -611,8 +611,8 @@ def _toml_key(name: str) -> str:
 def _toml_value(value: Any) -> str:
     """Return a value of a description as TOML writes it.
 
-    A dict is written in one line, `{ unit = "N", factor = 2.0 }`; but if it has only a unit, as
-    this text. A list of one item is written as that item.
+    A dict is written in one line, `{ unit = "N", factor = 2.0 }`; but a dict that has only a unit
+    is written as the text of the unit, `"N"`. A list of one item is written as that item.
     """
     if isinstance(value, Mapping):
         if {*value} == {"unit"}:

@@ -77,8 +77,8 @@ def check_agreement(data: Dataset, trace_spec: TraceSpec) -> None:
     If both rates are known, they must be the same within 2 % of the higher one; if both have
     channel names, these must be the same in the same order. Traces that were read by a description
     (`data.lengths` is set) must have the store's number of samples, and the store and the data set
-    must both have the `fit` "resample", or neither. The number of channels, the units and the limit
-    are not compared. Raises SettingError where `data.spec` does.
+    must both have the `fit` "resample", or neither. The number of channels, the units and the range
+    of the sensor (`limit`) are not compared. Raises SettingError if `data.spec` does.
     """
     spec = data.spec
     is_resampled = {item.fit == "resample" for item in (spec, trace_spec)}
@@ -140,19 +140,22 @@ def import_labelled(
     """Put every labelled trace of a data set into a store, in order; nothing is trained.
 
     The traces are stored in chunks, each in one transaction: if an import is interrupted, the same
-    call continues it. A trace that the store has from an earlier import is not stored again.
+    call continues it. A trace that the store has from an earlier import is not stored again, but a
+    trace that a cell recorded itself is.
 
     Parameters
     ----------
     store : path, URL or store
-        A new store, which is created, or a used one. A store object stays open, and so does the
-        engine that this call makes on it.
+        A new store, which is created, or a used store. A store object stays open, and so does the
+        engine that this call makes on it; but if the engine cannot be made, the store object may be
+        closed.
     dataset : object
         Anything `load_dataset` takes. Recordings that a description describes are brought to the
         length of the store's traces.
     recipe, seed : optional
-        For the engine of a new store; by default recipe conv and seed 0. A used store has its own
-        recipe and seed; other values raise SettingError.
+        For the engine of a new store; by default those of another cell of its product, or else
+        recipe conv and seed 0. A used store has its own recipe and seed; other values raise
+        SettingError.
     on_traces : callable, optional
         Called after each chunk with its number of traces, also those that the store had already.
     allow_import : bool
@@ -214,9 +217,10 @@ def import_parts(
     has a label for a decision, also a forgotten one, nothing is changed: the new label is counted
     as repeated or contradicted. A decision that it has without a label stays as it is, too, and
     gets only the label. New rows have the time of the import. A trace with a fault is stored but
-    never used in training, and its decision gets the fault as its reason. With `stops="some"` each
-    label also stores the number of accepted parts without a report since the label before; the
-    label of a trace with a fault stores 0, and the next label counts these parts.
+    never used in training, and its decision gets the fault as its reason. If `policy.stops` is
+    "some", each label also stores the number of accepted parts without a report since the label
+    before, or since the last change of the policy; the label of a trace with a fault stores 0, and
+    the next label counts these parts.
 
     Parameters
     ----------
@@ -312,8 +316,8 @@ def _verifying_decisions(traces: TraceArray, data: Dataset) -> Iterator[Decision
 
     The id of a decision is made of the hash of the trace's content and a counter of equal traces,
     so that the same data set gives the same ids. The parts' numbers are those of `data`. Raises
-    TraceError for a part's number that is empty, has more than 200 characters, or one that does
-    not print; the decisions before it are yielded.
+    TraceError for a part's number that is empty, has more than 200 characters, or has characters
+    that do not print; the decisions before it are yielded.
     """
     n_equal = Counter[int]()
     parts = [None] * len(data) if data.part is None else data.part.tolist()

@@ -37,18 +37,20 @@ def load_dataset(
     source : str, path, Dataset, DataFrame or pair (X, y), default "insertion"
         The name of a bundled set, or recordings that a description describes: a folder, a file or a
         DataFrame. No description is needed for a `Dataset`; arrays X (n, T) or (n, C, T) and y
-        (n,); an .npz file with X, y, and perhaps scale, rate_hz, unit, cause (why a part failed),
-        channels and part; a table that `Dataset.to_frame` made, or its Parquet file; the SQLite
-        file of a store, of which the labelled traces are read (a damaged one is left out, and the
-        store gets an event on it). A file or table of these is read by a description all the same
-        if one is given, or saved beside the file.
+        (n,); an .npz file with X, y of 1 and 0, and perhaps scale, rate_hz, unit, cause (why a part
+        failed), channels and part; a table that `Dataset.to_frame` made, or its Parquet file; the
+        SQLite file of a store, of which the labelled traces of the cell named "cell" and of the
+        other cells of its product are read (a damaged trace is left out, and the store gets an
+        event on it). Such a file or table is read by a description all the same if a description is
+        given, or saved beside the file.
     description : Description, dict or path, optional
         How the recordings are written; DataError beside a `Dataset`, a pair or the name of a
         bundled set. None: the description that was saved, as `recordings.toml` in the folder or
         `FILE.toml` beside the file.
     channels : str or sequence of str, optional
         The channels to read, "FZ_Base" or "FZ_Base,FX_Base", among those that the description or
-        the data set names. None: all channels.
+        the data set names. None: all channels of the data set, or those in `[channels]` of the
+        description.
     samples : int, optional
         Number of samples of each trace: the rest is cut off at the end. None: as the description
         states, or as the data set is.
@@ -67,16 +69,20 @@ def load_dataset(
     DataError
         If the description is missing or has a key whose value is `?` (the message says what to
         type), if the source or a channel does not exist, if no recording is left, if `samples` is
-        below 1, or if the traces are shorter than `samples`, or longer although they were
-        resampled. Also if none of the files can be read, a listing of labels cannot, or the traces
-        and labels do not fit together (`make_dataset`), as those of a table of `Dataset.to_frame`
-        that was changed.
+        below 1, or if the traces are shorter than `samples`, or longer with the `fit` "resample".
+        Also if none of the files can be read, a listing of labels cannot be read, the rows of a
+        store contradict its ledger, or the traces and labels do not fit together (`make_dataset`),
+        like those of a table of `Dataset.to_frame` that was changed.
     SettingError
-        If `windows.trigger` of the description, which cuts long recordings, is malformed.
+        If `windows.trigger` of the description, which cuts long recordings, is malformed, or if
+        `channels` is given for a data set of which `Dataset.spec` cannot be made.
     ValueError
         If the index of a DataFrame that a description describes is named like one of its columns.
     StoreError
-        If the store in a SQLite file cannot be opened or read, or has traces of several shapes.
+        If the store in a SQLite file cannot be opened or read, has no cell named "cell", or has
+        traces of several shapes.
+    Exception
+        What pandas raises for a damaged Parquet file of a table of `Dataset.to_frame`.
     """
     stated = channels.split(",") if isinstance(channels, str) else channels or ()
     names = tuple(map(str.strip, stated))
@@ -124,10 +130,10 @@ def description_of(
     Raises
     ------
     DataError
-        If no description was saved (the message says what to type), none is given for a DataFrame,
-        the source does not exist, a stated key is unknown or its value of the wrong type, or a
-        description cannot be read or proposed. Without `propose`, too, a proposal is made for the
-        message, and its errors come first.
+        If no description was saved (the message says what to type), none is given for a DataFrame
+        (even with `propose`), the source does not exist, a stated key is unknown or its value of
+        the wrong type, or a description cannot be read or proposed. Without `propose`, too, a
+        proposal is made for the message, and its errors come first.
     SettingError
         If none was saved, and a stated `windows.trigger` is malformed.
     """
@@ -170,13 +176,14 @@ def missing_text(path: Path, proposal: Description) -> str:
 def own_reader(source: Any) -> Callable[[], Dataset] | None:
     """Return a function that reads a source in a format of dengine; None if it needs a description.
 
-    The formats: a `Dataset`, which the function returns itself, a tuple (X, y), the name of a
-    bundled set, a table of `Dataset.to_frame` or its Parquet file, an .npz file with X and labels y
-    of 1 and 0, and a SQLite file, which must be a store. The function takes no arguments and raises
-    the errors of `load_dataset`. A folder needs a description, and so does a file beside which one
-    was saved, whatever it holds. Raises DataError for a source of an unknown type, for a path that
-    does not exist, for a file that cannot be opened, for a damaged .npz or Parquet file, for an
-    .npz file whose y holds Python objects, and for a Parquet file without pyarrow.
+    The formats are a `Dataset`, which the function returns itself, a tuple (X, y), the name of a
+    bundled set, even if a file or folder has this name, a table of `Dataset.to_frame` or its
+    Parquet file, an .npz file with X and labels y of 1 and 0, and a SQLite file, which must be a
+    store. The function takes no arguments and raises the errors of `load_dataset`. A folder needs a
+    description, and so does a file beside which a description was saved, whatever the file holds.
+    Raises DataError for a source of an unknown type, for a path that does not exist, for a file
+    that cannot be opened, for a damaged .npz or Parquet file, for an .npz file whose y holds Python
+    objects or needs too much memory, and for a Parquet file without pyarrow.
     """
     if isinstance(source, Dataset):
         return lambda: source
@@ -255,8 +262,8 @@ def _read_npz(path: Path) -> Dataset:
     """Return the data set of an .npz archive with X and labels y of 1 and 0.
 
     Of the other arrays scale, rate_hz, unit, cause, channels and part are read if they are there. X
-    is multiplied by `scale`. Raises DataError if the archive is damaged, or the arrays do not fit
-    together.
+    is multiplied by `scale`. Raises DataError if `read_archive` refuses the file, an array cannot
+    be converted, or `make_dataset` refuses the arrays.
     """
     arrays, _ = read_archive(path, OWN_ARRAYS)
     with read_errors(path, "an .npz file of plain arrays"):
@@ -279,15 +286,15 @@ def _read_npz(path: Path) -> Dataset:
 def _read_store(path: Path) -> Dataset:
     """Return the labelled traces of a store, in the order of their labels, corrections applied.
 
-    The labels are those of the store's cell and of the other cells of its product. Quarantined
+    The labels are those of the cell named "cell" and of the other cells of its product. Quarantined
     traces and forgotten labels are left out. So is a trace that is missing or not as it was stored,
     and an event is written to the store, or logged if that fails. If several traces are of one
     part, `part` is the hash by which the store counts them as one part; otherwise it is None. The
     store is closed.
 
-    Raises DataError if the store has no labelled traces, or if its rows contradict its ledger, the
-    chain of hashes over them. Raises StoreError if the store cannot be opened or read, and if its
-    traces have different shapes.
+    Raises DataError if the store has no labelled traces, if its rows contradict its ledger, the
+    chain of hashes over them, or if `make_dataset` refuses the traces. Raises StoreError if the
+    store cannot be opened or read, has no such cell, or has traces of different shapes.
     """
     from ..store.opening import opening
 

@@ -104,9 +104,9 @@ class Table:
     def words(self, name: str) -> Cells:
         """Return the cells of a column as texts, without blanks around them.
 
-        The shape is (rows,), or (1,) if one cell holds for all rows. Whole numbers have no decimal
-        point: 1.0 is "1". NaN and None are "". Raises UnreadableError if there is no such column,
-        or its cells are lists.
+        The shape is (rows,), or (1,) if one cell holds for all rows. A whole float has no decimal
+        point: 1.0 is "1", but the text "1.0" stays "1.0". NaN and None are "". Raises
+        UnreadableError if there is no such column, or its cells are lists.
         """
         cells = self.column(name).tolist()
         with instead(UnreadableError, f"Expected texts or numbers in {name}", TypeError):
@@ -116,10 +116,11 @@ class Table:
     def numbers(self, name: str, form: TextForm) -> Floats:
         """Return a column as numbers, float64 (rows,) or (1,); a missing number is NaN.
 
-        `form` is the section `[text]`, with the decimal mark, the mark of thousands and the words
-        for a missing number; a column of numbers does not need it. Raises UnreadableError if there
-        is no such column, and for any other cell: one that is no number of this form, is infinite,
-        or is too large for float32.
+        `form` is the section `[text]` of the description, with the decimal mark, the mark of
+        thousands and the words for a missing number; a column of numbers does not need it. Raises
+        UnreadableError if there is no such column, and for a cell that is no number of this form,
+        is infinite, or is too large for float32. An empty cell or None is such a cell, unless "" is
+        among the words for a missing number.
         """
         cells = self.column(name)
         if cells.dtype.kind not in "iuf":
@@ -134,9 +135,9 @@ class Table:
     def refuse(self, is_bad: Cells, wanted: str, name: str) -> None:
         """Raise UnreadableError for the first row in which `is_bad` is True; if none is, return.
 
-        is_bad : bool, shape (rows,). wanted : what was expected, for the message. name : the column
-        whose cell the message shows. The error has the line, if known, and the column: the one in
-        the file if `origin` has it, else `name`.
+        is_bad : bool, one for each cell of the column. wanted : what was expected, for the message.
+        name : the column whose cell the message shows. The error has the line, 0 if it is unknown,
+        and the column: the file's column of this cell if `origin` has it, else `name`.
         """
         if is_bad.any():
             row = int(is_bad.argmax())
@@ -198,7 +199,7 @@ class Recording:
 def as_word(cell: Any) -> str:
     """Return a cell as a text without blanks around it.
 
-    NaN and None are "", and a whole number has no decimal point: 1.0 is "1".
+    NaN and None are "", and a whole float has no decimal point: 1.0 is "1". The text "1.0" stays.
     """
     if cell is None or cell != cell:
         return ""
@@ -212,7 +213,8 @@ def pattern_of(decimal: str, thousands: str) -> re.Pattern[str]:
 
     `decimal` is its decimal mark, and `thousands` the mark that may stand between groups of three
     digits; "" allows no groups. The digits before or behind the decimal mark may be missing, but
-    not both. The pattern is for `fullmatch`, and has no blanks around the number. It is cached.
+    not both. The minus sign U+2212 is accepted, too, but not in the exponent. The pattern is for
+    `fullmatch`, and has no blanks around the number. It is cached.
     """
     mark = re.escape(thousands)
     point = re.escape(decimal)
@@ -224,9 +226,9 @@ def pattern_of(decimal: str, thousands: str) -> re.Pattern[str]:
 def _number(cell: Any, form: TextForm, pattern: re.Pattern[str]) -> float:
     """Return the number in a cell; NaN for a word of `form.missing`, infinity for any other text.
 
-    A float is returned as it is; None is read as an empty cell. A number too large for float64 is
-    infinity. `form` has the decimal mark and the mark of thousands, and `pattern` is the regular
-    expression of a number with these.
+    A float is returned as it is. None is read as "", which is infinity unless `form.missing` has
+    it. A number too large for float64 is infinity. `form` has the decimal mark and the mark of
+    thousands, and `pattern` is the regular expression of a number with these.
     """
     if isinstance(cell, float):
         return cell

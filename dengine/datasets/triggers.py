@@ -101,8 +101,10 @@ def as_trigger(value: Any) -> Trigger:
     "register=1@NAME": it is 1. "contact=5": the force FZ_Base is 5 N or more, in either direction.
     "motion=0.002": the tool moves faster than 2 mm a second. Only bit and contact need a number;
     without it, register means any value but zero and motion 0.002. A bit is 0 to 31, a register's
-    number any integer, a force and a speed are above 0. Without @SIGNAL each kind reads a default
-    signal; its `quiet_s` is that of the kind. Raises SettingError for any other value.
+    number any integer; a force and a speed are decimals above 0, without an exponent. They are
+    compared with the signal as it was recorded: no unit is converted. Without @SIGNAL the signal is
+    that of the kind in `KINDS`, and the trigger's `quiet_s` always is. Raises SettingError for any
+    other value.
     """
     if isinstance(value, Trigger):
         return value
@@ -159,7 +161,7 @@ class StartFinder:
 
         If the sample before came 1.5 steps (`step`, the seconds between samples) ago or more,
         samples are missing; the insertion may have begun in this gap, and `seen` of the result is
-        False. Its `time` is then the first time in the gap, else the time of this sample.
+        False. Its `time` is then one step after the sample before, else the time of this sample.
         """
         if not active:
             self._off_since = time if self._off_since is None else self._off_since

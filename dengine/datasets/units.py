@@ -42,7 +42,7 @@ def conversion(unit: str, wanted: str) -> float | None:
     """Return the factor from a unit to the unit `wanted`; 1 if they are the same or either is "".
 
     Brackets around a unit are ignored. None if the units are of different quantities, like force
-    and length, or if they differ and one is unknown.
+    and length, or if they differ and one is unknown or is converted to no other, like `rpm`.
     """
     units = (bare(unit), bare(wanted))
     if not all(units):

@@ -160,7 +160,7 @@ def cusum(share: float, parts: float) -> tuple[int, int]:
 
     References
     ----------
-    Page (1954), Biometrika 41; that it is the soonest: Moustakides (1986), Annals of Statistics 14.
+    Page (1954), Biometrika 41. Its optimality: Moustakides (1986), Annals of Statistics 14.
     """
     doubled = min(2.0 * share, 0.99)
     odds = math.log((1.0 - share) / (1.0 - doubled))
@@ -298,10 +298,11 @@ class Certificate:
 
         It is check * n_unchecked - escape * min(n_unchecked, n * upper), where `check` and `escape`
         are the prices of a check and of a bad part that is accepted, and the other names are
-        attributes of `accepted`: the parts without a check, all parts including audited ones, and
-        the bound on their mean failure probability. An audited part saves no check, and it cannot
-        escape. The result bounds the expected saving. It may be negative: then not checking may
-        have cost money. None without prices.
+        attributes of `accepted`: the parts without a check, all parts that the bound is about
+        (audited parts are among them if it comes from audits), and the bound on their mean failure
+        probability. An audited part saves no check, and it cannot escape. The result bounds the
+        expected saving. It may be negative: then not checking may have cost money. None without
+        prices.
         """
         if self.prices is None:
             return None
@@ -353,13 +354,13 @@ class Certificate:
                 result = f"nothing was saved for certain, and at most {-balance:,} was lost"
             which = "them" if n_unchecked == self.accepted.n else f"{n_unchecked:,} of them"
             claim += (
-                f" Not checking {which} spared {checks:,.6g} of checks, and bad parts cost at most "
-                f"{math.ceil(escapes):,} on average: {result}."
+                f" Not checking {which} spared {checks:,.10g} of checks, and bad parts cost at "
+                f"most {math.ceil(escapes):,} on average: {result}."
             )
         return (
             f"{claim} Accepting pauses whenever the parts that the model would accept have, by "
-            f"what is known of them, cost {OVERDRAFT * self.prices[1]:,g}, {OVERDRAFT:g} times the "
-            f"price of a bad part, more than their checks."
+            f"what is known of them, cost {OVERDRAFT * self.prices[1]:,.10g}, {OVERDRAFT:g} times "
+            f"the price of a bad part, more than their checks."
         )
 
     @property
@@ -375,12 +376,13 @@ class Certificate:
         """Return the claim about a group of parts as one sentence.
 
         It gives the number of parts, the bound in per cent, rounded up, the confidence, and the
-        tolerance or, with prices, the share up to which the decision pays. Nothing can be said if
-        the group is empty, if its `propensity` is 0 (`unknown` says why; for accepts: nothing
-        beyond the line stops that are known), or if the bound is 1. `which` describes the parts.
-        With audits they are those that the model would `verb` ("accept", "reject"), and so many
-        were audited; in shadow mode each was checked. `wrong` is "bad" or "good", what a wrongly
-        decided part was.
+        tolerance or, with prices, the share up to which the decision pays. If the group is empty,
+        its `propensity` is 0 or the bound is 1, the sentence says instead that nothing can be said,
+        and why. For a propensity of 0 the reason is `unknown`, and for accepts nothing can be said
+        "beyond the known stops". `which` describes the parts. With audits the sentence says in its
+        place that the model would `verb` ("accept", "reject") these parts and how many of them were
+        audited, or, if the group is `shadowed`, that each was checked. `wrong` is "bad" or "good",
+        what a wrongly decided part was.
         """
         parts = counted(group.n, "part")
         but = " beyond the known stops" if verb == "accept" else ""

@@ -80,7 +80,8 @@ class WilsonRadiusClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[mi
         TypeError
             If Z is sparse.
         SettingError
-            For a radius or a setting of the policy out of its range; `capacity` is not checked.
+            For `radius`, `alpha`, `lower_bound` or `interval` out of its range; `capacity` is not
+            checked.
         """
         Z, y = validate_data(self, Z, y)
         self.classes_ = classes_of(y)

@@ -105,7 +105,7 @@ class Decider(nn.Module):
         Parameters
         ----------
         x : Tensor of float32, shape (C, T)
-            The trace.
+            The trace, contiguous.
         part : int, default 0
             Hash of the number of the part that the trace is of, 0 if unknown: then the content hash
             stands for the part. References (labelled points) of this part do not count.
@@ -127,7 +127,8 @@ class Decider(nn.Module):
         lower, upper : float
             Bound on the success probability; (0, 1) without a prediction.
         n_success, n_failure : int
-            Labels within the radius; 0 without a prediction.
+            Labels of each kind within the model's radius around the embedding; 0 without a
+            prediction.
         embedding : Tensor of float32, shape (K, d)
             A point in each of the K embedding spaces, also if a force limit decides; NaN for a
             faulty trace.

@@ -421,7 +421,7 @@ class MemberEvidence(nn.Module):
         The target is the lowest level (possible threshold) whose parts since the last alarm give
         enough evidence. The evidence is the log capital of a bet on the tolerance, of which log(1 /
         alpha) is enough. Under the priced rule (guarantee `cost`) it is what was saved minus what
-        errors cost, in units of one error, of which -2 (`OVERDRAFT`) is enough for accepting and 0
+        errors cost, in units of one error, of which -2 (-`OVERDRAFT`) is enough for accepting and 0
         for rejecting. Under the pooled rule it is also required that few of the newest 50 parts of
         the level were wrong (`max_recent_errors`). If no level meets this, the target is the
         strictest level. The threshold is the score of the target if such a level was found, all

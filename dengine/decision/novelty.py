@@ -118,15 +118,15 @@ class NoveltyGate(nn.Module):
 
     @torch.jit.export
     def scores(self, x: Tensor) -> Tensor:
-        """Return four scores of a trace (C, T), float32 (4,); a trace with one above 1 is novel.
+        """Return four scores of a trace (C, T), float32 (4,); if any is above 1, it is novel.
 
-        Each score looks at one group of features: the level of the signals, their texture (how
-        rough they are), distortions (what a faulty sensor or clock would do), and gaps. It is the
-        squared distance to the nearest reference in these features, divided by the limit of the
-        group; references are traces that the gate was fitted to. A reference in a small cluster of
-        unusual traces counts as nearer than it is, so a score near it may be below 0. A score is
-        NaN or infinite if a feature overflows; the trace is novel then, too. The scores of a
-        disabled gate mean nothing.
+        Each score looks at one group of features, in this order: the level of the signals, their
+        texture (how rough they are), distortions (what a faulty sensor or clock would do), and
+        gaps. It is the squared distance to the nearest reference in these features, divided by the
+        limit of the group; references are traces that the gate was fitted to. A reference in a
+        small cluster of unusual traces counts as nearer than it is, so a score near it may be below
+        0. A score is NaN or infinite if a feature overflows; the trace is novel then, too. The
+        scores of a disabled gate mean nothing.
         """
         plain = self.plain_features(x)
         features = torch.cat([plain, plain @ self.discriminants])
@@ -188,13 +188,13 @@ def fit_novelty(
     traces : array of float32, shape (n, C, T)
         Finite, with any labels, oldest first.
     margin : float
-        Factor on the limits, which are squared distances; above 0, which is not checked. A limit is
-        the 99.5 % quantile of the references' squared distances to the nearest other reference, at
-        least 0.001; it is capped at six times the 90 % quantile, so that a few outliers do not set
-        it. With n < 200 different references it is multiplied by 200 / n; the limit of distortions
-        is multiplied by 500 / n with n < 500. The limit of gaps is at least 4 in the end. An
-        outlier in a cluster of outliers has a wider limit, by the distance to its third nearest
-        outlier.
+        Factor on the limits, which are squared distances of standardised features; above 0, which
+        is not checked. A limit is the 99.5 % quantile of the references' squared distances to the
+        nearest other reference, capped at six times the 90 % quantile, so that a few outliers do
+        not set it, and at least 0.001. With k < 200 different references it is multiplied by
+        200 / k; the limit of distortions is multiplied by 500 / k with k < 500. The limit of gaps
+        is at least 4 in the end. An outlier in a cluster of outliers has a wider limit, by the
+        distance to its third nearest outlier.
     parts : array of int64, shape (n,), optional
         Hash of the part of each trace; traces with the same value, also 0, are of one part. None:
         each trace is of another part. Only distances between different parts and different traces
@@ -305,7 +305,8 @@ def _discriminants(gate: NoveltyGate, x: Tensor, plain: Tensor, used: Tensor) ->
     features that are not standardised. `plain` (n, P), float64, are the traces' features by `gate`.
     Only features that `used` (P,), bool, marks are read; the rows of the others are 0. Of the
     traces fewer than 250, evenly spaced, are distorted, for the mean difference. The covariance is
-    that of all traces, shrunk towards the identity, plus half of that of the distorted. Inside,
+    that of all traces, plus the identity times (used features / n)**2, because the covariance of
+    few traces is not known, plus half of the covariance of the distorted traces. Inside,
     standardised features are clipped at 6 deviations.
     """
     offset, gain = (used * values for values in _standardise(plain))
@@ -368,8 +369,9 @@ def _usual_distance_and_reach(points: Tensor, same: Tensor) -> tuple[float, Tens
     does not count. The usual distance is the 99.5 % quantile of squared distances to the nearest
     other point, at most six times their 0.9 quantile, and at least 0.001. Outliers are farther than
     that from all points, or than both 0.001 and three times the 0.9 quantile. The reach is the
-    usual distance; but of more than three outliers, one reaches to its third nearest outlier, if
-    that is farther and all other points are more than twice as far.
+    usual distance. But if there are more than three outliers, the reach of an outlier is the
+    distance to its third nearest outlier, if this is larger, and if all points that are no outliers
+    are more than twice as far away.
     """
     norms = points.square().sum(1)
     squared = torch.addmm(norms + norms[:, None], points, points.t(), alpha=-2.0)

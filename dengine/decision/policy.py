@@ -201,8 +201,8 @@ class Policy:
 
         `values` holds the settings by name. The force limits are one text, separated by spaces, or
         "none"; in older stores their name is "windows". Names that are no settings are ignored. A
-        missing audit rate, guarantee or price follows from the others, as in the class. Raises
-        SettingError for a value out of its range.
+        missing audit rate, guarantee or `prices` follow from the other settings, as in the class.
+        Raises SettingError for a value out of its range.
         """
         names = [field.name for field in fields(cls)]
         settings = {name: values[name] for name in names if name in values}
@@ -215,8 +215,8 @@ class Policy:
 
         If `prices` are among them, but no guarantee, and this policy has the guarantee "local" or
         "pooled", which have no prices, then the guarantee becomes "cost", and an audit rate of 0
-        becomes 0.05, unless the settings have one. Raises SettingError for a value out of its
-        range, TypeError for a name that is no setting.
+        becomes 0.05, unless the settings have an audit rate. Raises SettingError for a value out of
+        its range, TypeError for a name that is no setting.
         """
         implied: dict[str, Any] = {}
         has_prices_alone = settings.keys() & {"prices", "guarantee"} == {"prices"}
@@ -343,9 +343,10 @@ class Policy:
         return INTERVALS[self.interval](n_success, n_failure, error_level)
 
     def action(self, lower: float, upper: float) -> Action:
-        """Return the action that one bound allows by the paper's rule, whatever the guarantee is.
+        """Return the action that a bound (lower, upper) allows, whatever the guarantee is.
 
-        ACCEPT if lower >= LB, otherwise REJECT if upper <= 1 - LB, otherwise VERIFY, also for NaN.
+        It is the paper's rule: ACCEPT if lower >= `lower_bound`, otherwise REJECT if upper <= 1 -
+        `lower_bound`, otherwise VERIFY, also for NaN. Shadow mode and force limits have no effect.
         """
         from .rule import action_of
 

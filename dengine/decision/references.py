@@ -458,7 +458,7 @@ class RadiusIndex(nn.Module):
         """Return the SHA-256 of points, labels and embedding spaces as 64 hexadecimal digits.
 
         The bytes are points (d, n) float32, labels float32 and spaces int64, one after the other,
-        each in the order of the points in the index.
+        each in the order of the slots, the positions of the points in the index.
         """
         points = self.column("points").T
         labels = self.column("labels").astype(np.float32)

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from ..errors import StoreError
+from ..errors import VersionError
 from ..records import Arrays, State
 
 _SCRIPTING = threading.Lock()
@@ -86,10 +86,10 @@ def register_tensors(module: nn.Module) -> None:
     """Make the plain tensors of a module part of its `state_dict`, as persistent buffers.
 
     These are attributes that hold a tensor, and buffers that are not persistent, also of its
-    submodules. A tensor that is not contiguous is copied, since an expanded view, in which several
-    numbers share memory, cannot be written to. Tensors in a list, tuple or dict stay as they are,
-    and so does a tensor whose name is an attribute of the class of its module. Modules are changed
-    in place.
+    submodules. A tensor that is not contiguous is replaced by a copy, also if it is a persistent
+    buffer already, since an expanded view, in which several numbers share memory, cannot be written
+    to. Parameters and tensors in a list, tuple or dict stay as they are, and so does a tensor whose
+    name is an attribute of the class of its module. Modules are changed in place.
     """
     for submodule in module.modules():
         for name, value in attributes_of(submodule).items():
@@ -139,12 +139,12 @@ def restore(module: nn.Module, arrays: Arrays) -> None:
         tensors[name].copy_(torch.from_numpy(np.array(array)))
 
 
-def incompatible_model_error(defect: str) -> StoreError:
+def incompatible_model_error(defect: str) -> VersionError:
     """Return the error for a stored model of another reducer, or of another version of dengine.
 
     `defect` ends the phrase "got one whose ...", for example "encoder has other sizes".
     """
-    return StoreError(
+    return VersionError(
         "Expected a model of this reducer and of this version of dengine, got one whose "
         f"{defect}; its labels are whole: pass the reducer of the store, or learn from them anew, "
         "by `dengine train --data OLD.db --store NEW.db`."

@@ -103,7 +103,8 @@ class Corrections:
         again, even if nothing changes; one that is done is put in force or dropped. See the class
         for what else every change does first, and for the check against the ledger. If a safe mode
         begins or ends by this, an event is recorded, and `on_safe_mode`, the user's function, is
-        called.
+        called. Without an executor the call also waits until the features for the next training are
+        computed, if that starts from another model because labels were forgotten.
 
         Parameters
         ----------
@@ -129,7 +130,8 @@ class Corrections:
             engine is closed, was opened for reading or before a fork. A change that was stored
             before the error stays stored.
         Exception
-            What a pinned baseline raises that is fitted again; the change is stored then.
+            What a baseline raises as it is copied for a retrain or, if it is pinned, fitted again;
+            the change is stored then.
         """
         label = as_success(success)
         (stored,) = self._find_labelled([decision_id])
@@ -148,17 +150,17 @@ class Corrections:
         `correct` brings a forgotten label back. Traces, and labels as they were reported, stay in
         the store, and so do the versions that were trained with them. The version in force goes on
         until the next retrain, which starts from weights that never saw these labels. If a rollback
-        pinned this version, and it was trained with one of these labels, it is released, so that
-        retrains may replace it: it is stored as a new version, before the labels are forgotten. A
-        baseline is retrained before this returns; if it stays pinned, it is fitted again as a new
-        version. A training under way in the executor is discarded, and begins again, even if
-        nothing changes; one that is done is put in force or dropped. See the class for what else
-        every change does first, and for the check against the ledger. If a safe mode begins or ends
-        by this, an event is recorded, and `on_safe_mode`, the user's function, is called. Without
-        an executor the call also waits until the features for the next training are computed, if
-        that starts from another model now. A guarantee assumes that the choice of what is forgotten
-        does not depend on the label. The certificate counts a forgotten outcome of a certain
-        decision as wrong, so that forgetting earns nothing.
+        pinned this version, and one of these labels is among those of its training or older than
+        all of them, it is released, so that retrains may replace it: it is stored as a new version,
+        before the labels are forgotten. A baseline is retrained before this returns; if it stays
+        pinned, it is fitted again as a new version. A training under way in the executor is
+        discarded, and begins again, even if nothing changes; one that is done is put in force or
+        dropped. See the class for what else every change does first, and for the check against the
+        ledger. If a safe mode begins or ends by this, an event is recorded, and `on_safe_mode`, the
+        user's function, is called. Without an executor the call also waits until the features for
+        the next training are computed, if that starts from another model now. A guarantee assumes
+        that the choice of what is forgotten does not depend on the label. The certificate counts a
+        forgotten outcome of a certain decision as wrong, so that forgetting earns nothing.
 
         Parameters
         ----------
@@ -179,11 +181,12 @@ class Corrections:
             label is forgotten.
         StoreError
             If the store does not answer, the trace of a decision is damaged, another cell of the
-            product stores a version meanwhile and a pinned one is to be released, or the engine is
-            closed, was opened for reading or before a fork. A change that was stored before the
-            error stays.
+            product stores a version meanwhile and a pinned one is to be released or fitted again,
+            or the engine is closed, was opened for reading or before a fork. A change that was
+            stored before the error stays stored.
         Exception
-            What a pinned baseline raises that is fitted again; the change is stored then.
+            What a baseline raises as it is copied for a retrain or, if it is pinned, fitted again;
+            the change is stored then.
         """
         if not decision_ids:
             raise ReportError(
@@ -208,12 +211,12 @@ class Corrections:
     def release(self, author: str = "") -> Changed:
         """Let retrains replace again the version that `rollback` pinned.
 
-        First a trained version is put in force or dropped, labels are stored, and news of peers is
-        taken in, even if no version was pinned. The same model goes on, stored as a new version.
-        Labels that came meanwhile count for the next retrain, which may be due at once. A training
-        under way in the executor is discarded, and begins again, even if no version was pinned. If
-        a version was pinned, and a safe mode began or ended meanwhile, an event is recorded, and
-        `on_safe_mode`, the user's function, is called.
+        First a trained version is put in force or dropped, labels are stored, and what the
+        product's other cells stored is taken in, even if no version was pinned. The same model goes
+        on, stored as a new version. Labels that came meanwhile count for the next retrain, which
+        may be due at once. A training under way in the executor is discarded, and begins again,
+        even if no version was pinned. If a version was pinned, and a safe mode began or ended
+        meanwhile, an event is recorded, and `on_safe_mode`, the user's function, is called.
 
         Parameters
         ----------
@@ -244,8 +247,8 @@ class Corrections:
         with all corrections. The decision rule in force goes on. While the version is pinned, new
         labels are stored and counted and become its references, but no automatic retrain replaces
         it. It stays pinned until `release`, a retrain that somebody asks for, or `forget` of a
-        label that it was trained with; the next retrain then starts from this version, unless it
-        saw a forgotten label.
+        label that it was trained with or that is older than all of these; the next retrain then
+        starts from this version, unless it saw a forgotten label.
 
         A training under way in the executor is discarded, even if nothing changes, and no other one
         begins, unless this raises; a training that is done is put in force or dropped first. See
@@ -281,7 +284,8 @@ class Corrections:
             if another cell of the product stores a version meanwhile, or if the engine is closed,
             was opened for reading or before a fork.
         Exception
-            What a model raises that must be fitted again.
+            What a model raises that must be fitted again; for the state of another reducer in rare
+            cases KeyError, ValueError or NotImplementedError.
         """
         do = "`store.versions.retrains()` lists them"
         expect(is_whole(version, -(2**63), 2**63 - 1), "the number of a version", version, do)
@@ -317,10 +321,11 @@ class Corrections:
 
         A handed-in model keeps its rule, whatever changes.
 
-        A safe mode goes on until new outcomes end it. If the new rule has no safe mode, the safe
-        mode ends now, an event is recorded, and `on_safe_mode`, the user's function, is called. An
-        accepted part whose outcome was not reported before the change stays unreported. With
-        `Policy(shadow=True)` each part that the model is certain of is an audit:
+        A safe mode goes on until new outcomes end it, but ends now if the new rule has none. If it
+        ends so, or if a safe mode began or ended meanwhile, an event is recorded, and
+        `on_safe_mode`, the user's function, is called. The next decision does not confirm a part
+        that was accepted before the change, also not with stops="all"; its outcome can still be
+        reported. With `Policy(shadow=True)` each part that the model is certain of is an audit:
         `Decision.predicted` says what the model would have done, and all outcomes are learned from
         as always. The shadow mode stays on when the engine is opened again.
 
@@ -343,10 +348,13 @@ class Corrections:
             If `policy` is no Policy. If its force limits do not fit the traces, or are in seconds
             while the rate of the traces is unknown. If the class of its guarantee cannot be
             imported or made. If a model was handed in, and a setting changes other than audit_rate,
-            stops, label_within, force_limits and shadow.
+            stops, label_within, force_limits and shadow. If the recipe of another cell of the
+            product cannot be read.
         StoreError
             If the store does not answer, another cell of the product stores a version meanwhile, or
             the engine is closed, was opened for reading or before a fork.
+        Exception
+            What the constructor of a user's rule raises, except TypeError.
         """
         expect(
             isinstance(policy, Policy),
@@ -427,8 +435,9 @@ class Corrections:
         the outbox's `integrity_error`. If a safe mode begins or ends by this, an event is recorded,
         and `on_safe_mode`, the user's function, is called. Raises StoreError if the store does not
         answer, or if another cell of the product stores a version while a pinned model is fitted
-        again, and what a pinned model raises that is fitted again; a change that is stored by then
-        is applied with the next one, or when the store is opened again.
+        again, and what a model raises as it is copied for a retrain or, if it is pinned, fitted
+        again; a change that is stored by then is applied with the next one, or when the store is
+        opened again.
         """
         number = self._store.corrections.apply(change)
         for id_ in change.decisions:

@@ -74,7 +74,7 @@ class DecisionMaker:
         A change is saved in the store; if the store does not take it, it is saved with a later
         trace; this is logged. Raises SettingError if the force limits do not fit the `TraceSpec`;
         then nothing changes. Saving raises it, too, if another cell of the product has settings
-        that contradict these; the new `TraceSpec` then stays in force here.
+        that contradict these; the new `TraceSpec` then stays in force here and is not saved.
         """
         store = self._outbox.store
         present = self._settings.now
@@ -123,11 +123,11 @@ class DecisionMaker:
     def find_earlier(self, decision_id: str, part: str | None, trace: Any) -> Decision | None:
         """Return the decision that the store already has for an id, or None for a new id.
 
-        The id comes from the caller, and `part` is the part's number. If the id cannot be looked
-        up, this is logged, and the decision returned is a VERIFY for this `part` with
-        `Reason.NO_STORE`. It is not recorded, because the id may have a decision already; `trace`
-        is not looked at. A report for this id then raises StoreError, until a later call can look
-        the id up.
+        The id comes from the caller, and `part` is the part's number, which is not compared with
+        that of a stored decision. If the id cannot be looked up, this is logged, and the decision
+        returned is a VERIFY for this `part` with `Reason.NO_STORE`. It is not recorded, because the
+        id may have a decision already; `trace` is not looked at. A report for this id then raises
+        StoreError, until a later call can look the id up.
 
         Raises
         ------
@@ -170,18 +170,19 @@ class DecisionMaker:
         decision_id : str, optional
             An id that the caller chose; None: a new one.
         verify_reason : Reason, optional
-            Verify for this reason, without asking the model and without checking the force limits;
-            but a fault of the trace is the reason instead. If the store is damaged or its journal
-            cannot be written, the reason is `Reason.NO_STORE` whatever is passed.
+            Verify for this reason, without asking the model and without checking the force limits.
+            If the store is damaged or its journal cannot be written, `Reason.NO_STORE` takes its
+            place, also if None is passed. A fault of the trace (`TraceGate`) takes the place of
+            both.
 
         Returns
         -------
         StoredDecision
             The record with its number. If another thread has recorded a decision for the id
             meanwhile, that decision is returned. Before the first training the decision is VERIFY,
-            `Reason.NO_MODEL`, unless the trace has a fault or is outside a force limit. If the
-            model raises, or returns bounds that are not 0 <= lower <= upper <= 1, that is logged,
-            and the decision is VERIFY, `Reason.MODEL_ERROR`.
+            `Reason.NO_MODEL`. If the model raises, or returns bounds that are not 0 <= lower <=
+            upper <= 1, that is logged, and the decision is VERIFY, `Reason.MODEL_ERROR`. In both
+            cases a fault of the trace, or a force limit that it leaves, decides instead.
         """
         if self._outbox.verify_all_reason:
             verify_reason = Reason.NO_STORE
@@ -191,10 +192,10 @@ class DecisionMaker:
     def sync(self, stored: StoredDecision) -> StoredDecision:
         """Wait until a decision and all earlier records are on disk; return the valid decision.
 
-        If that takes longer than the store's time limit, or a write fails, an ACCEPT or REJECT is
-        replaced by a VERIFY with `Reason.NO_STORE`, which is returned, and which is not on disk
-        yet. But if the first one has reached the disk meanwhile, it stays valid and is returned. A
-        VERIFY is returned as it is. A timeout is not raised.
+        If that takes longer than the store's time limit, or a write fails, nothing is raised: an
+        ACCEPT or REJECT is replaced by a VERIFY with `Reason.NO_STORE`, which is returned, and
+        which is not on disk yet. But if the first decision has reached the disk meanwhile, it stays
+        valid and is returned. A VERIFY is returned as it is, even if it is not on disk.
         """
         decision = stored.decision
         try:
@@ -214,7 +215,7 @@ class DecisionMaker:
         the store's time limit is over; the last two are not raised. A fault of the trace or the
         store is the reason instead of LATE. If the id has a decision already, that decision is
         returned. If the id cannot be looked up, the result is a VERIFY with `Reason.NO_STORE` that
-        is not recorded. With a store in memory, and while no `TraceSpec` is in force, the VERIFY is
+        is not recorded. With a store in memory, or while no `TraceSpec` is in force, the VERIFY is
         not recorded either, and the trace of a new id is not looked at: only the thread that uses
         the engine may do that.
 
@@ -245,13 +246,13 @@ class DecisionMaker:
     ) -> StoredDecision:
         """Decide on one trace by a model; return the decision as a record that is not stored yet.
 
-        A trace with a fault is verified for that reason, and its record is quarantined: it is never
-        trained on. Otherwise, with a `verify_reason` the decision is VERIFY for this reason, and
-        the force limits are not checked. Without it a trace outside a force limit is verified or
-        rejected, also without a model. Else, without a model the decision is VERIFY,
-        `Reason.NO_MODEL`. If the model raises, or returns bounds that are not 0 <= lower <= upper
-        <= 1, that is logged, and the decision is VERIFY, `Reason.MODEL_ERROR`. Without a
-        `decision_id` it gets a new id.
+        A trace with a fault (`TraceGate`) is verified for that reason, and its record is
+        quarantined: it is never trained on. Otherwise, with a `verify_reason` the decision is
+        VERIFY for this reason, and the force limits are not checked. Without it a trace outside a
+        force limit is verified or rejected, also without a model, and if the model raises. Else,
+        without a model the decision is VERIFY, `Reason.NO_MODEL`. If the model raises, or returns
+        bounds that are not 0 <= lower <= upper <= 1, that is logged, and the decision is VERIFY,
+        `Reason.MODEL_ERROR`. Without a `decision_id` it gets a new id.
 
         The decision is marked as an audit if the model was certain and the part is verified all the
         same. Its version is the one in force, also if no model was asked. The record has a copy of
@@ -363,8 +364,9 @@ def as_part(part: Any) -> str | None:
     Raises
     ------
     TraceError
-        For anything but None, a whole number of at most LONGEST characters (200, with its sign), or
-        a text of 1 to LONGEST printable characters. True and False are no numbers.
+        For anything but None, an integer, Python's or NumPy's, of at most LONGEST characters (200,
+        with its sign), or a text of 1 to LONGEST printable characters. True, False and floats such
+        as 7.0 are refused.
     """
     if part is None:
         return None

@@ -217,13 +217,14 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         """Make the objects of which the engine consists, on an opened store, and connect them.
 
         `template` is the untrained model, and the arguments from `executor` to `on_safe_mode` are
-        those of `DataEngine`. From now on the store is closed when the engine is garbage-collected.
-        The outbox claims the cell, writes what an earlier process left in the journal to the store,
-        and checks the store (`open_outbox`); version and labels are not restored yet (`_resume`).
-        Without an executor, and unless the engine only reads (`reading`), the modules that a
-        retrain imports are loaded; what that raises, for a reducer of the user's, is raised. Limits
-        this thread to one torch thread. Raises SettingError for force limits in seconds at an
-        unknown rate, and StoreError if another engine owns the cell or the store cannot be used.
+        those of `DataEngine`. Afterwards `_close_forgotten` closes the outbox, and with it a store
+        that is not in memory, when the engine is garbage-collected or the program ends. The outbox
+        claims the cell, writes what an earlier process left in the journal to the store, and checks
+        the store (`open_outbox`); version and labels are not restored yet (`_resume`). Without an
+        executor, and unless the engine only reads (`reading`), the modules that a retrain imports
+        are loaded; what that raises, for a reducer of the user's, is raised. Limits this thread to
+        one torch thread. Raises SettingError for force limits in seconds at an unknown rate, and
+        StoreError if another engine owns the cell or the store cannot be used.
         """
         recipe = settings.recipe
         check_rate(recipe.policy.force_limits, settings.trace)
@@ -261,14 +262,14 @@ class DataEngine(AbstractContextManager["DataEngine"]):
 
         The engine then decides bit for bit as before it was closed, with two exceptions: if the
         newest version is damaged, the newest intact one decides, and if the store differs from its
-        ledger, every part is verified. A new cell of a product decides by the product's newest
-        version. A model of which the store has only the numbers of its traces is trained on them
-        again; if one of these is damaged or missing, no model is in force. A thread may be started
-        that computes in advance for the next retrain. This method is called once, before the first
-        decision, and waits for the store without a time limit. If retrains run in the calling
-        thread, it also waits until the first retrain can begin without delay. Raises the errors of
-        `LiveModel.resume` and `Feedback.resume`; StoreError if the store cannot be read is one of
-        them.
+        ledger, every part is verified. A damaged version or trace is reported by an event in the
+        store. A new cell of a product decides by the product's newest version. A model of which the
+        store has only the numbers of its traces is trained on them again; if one of these is
+        damaged or missing, no model is in force. A thread may be started that computes in advance
+        for the next retrain. This method is called once, before the first decision, and waits for
+        the store without a time limit. If retrains run in the calling thread, it also waits until
+        the first retrain can begin without delay. Raises the errors of `LiveModel.resume` and
+        `Feedback.resume`; StoreError if the store cannot be read is one of them.
         """
         settings = self._settings.now
         self._learner.resume(settings.recipe.policy.label_within, settings.policy_since)
@@ -324,9 +325,9 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         an engine that only reads leaves them there and does not know them. Rows that are not as
         they were written are not raised: every part is verified then
         (`EngineState.integrity_error`). If the newest version is damaged, the newest intact one
-        decides. Without an executor, unless it only reads, the call also waits until a retrain can
-        begin at once. If it raises, a store that it opened is closed; an `SqlStore` that was passed
-        may be closed, too.
+        decides, and an event in the store says so, also with `reading`. Without an executor, unless
+        it only reads, the call also waits until a retrain can begin at once. If it raises, a store
+        that it opened is closed; an `SqlStore` that was passed may be closed, too.
 
         Parameters
         ----------
@@ -334,6 +335,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
             A file, a URL or an open store.
         reducer, model : object, optional
             If the engine had an object of yours that the store cannot name: the same object again.
+            A reducer's name is accepted, but not compared with the store's.
         trace : TraceSpec, optional
             The `TraceSpec` as the store has it, together with a rate, units or columns that were
             unknown so far; they are stored, unless `reading`. If the store has none yet, any.
@@ -366,8 +368,9 @@ class DataEngine(AbstractContextManager["DataEngine"]):
             only the numbers of its traces.
         SettingError
             If an object of yours is missing or is another one than the engine had, if a `model` is
-            given to an engine that has its own, if `trace` contradicts the stored `TraceSpec`, if
-            the stored recipe cannot be read, or if its force limits do not fit the traces.
+            given to an engine that has its own, if `trace` contradicts the stored `TraceSpec` or
+            that of another cell of the product, if the stored recipe cannot be read, or if its
+            force limits do not fit the traces.
         ImportRefusedError
             A SettingError, if a class would have to be imported that is not allowed.
         """
@@ -414,13 +417,14 @@ class DataEngine(AbstractContextManager["DataEngine"]):
             name is imported in any case.
         **settings
             As `DataEngine` takes them. For a used store, the given settings must be the settings in
-            force, so that a running cell does not change unnoticed. The shadow mode, a reducer that
-            is an object, and what is left out are not compared (for details see
-            `EngineSettings.check_request`). `model` and `trace` are as for `open`; `executor`,
-            `clock`, `replaying` and `on_safe_mode` are not stored, so any may be given. A new cell
-            of a product (cells that share labels and versions) takes the seed, and the recipe if it
-            is given neither recipe, reducer nor model, from the first of its peers, the other
-            cells.
+            force, so that a running cell does not change unnoticed. Of a recipe or policy all
+            fields are compared, also those at their defaults. The shadow mode, missing force limits
+            and arguments that are left out are not compared (`EngineSettings.check_request`). A
+            reducer that is an object, `model` and `trace` are as for `open`; `executor`, `clock`,
+            `replaying` and `on_safe_mode` are not stored, so any may be given. A new cell of a
+            product (cells that share labels and versions) takes the seed, if none is given, from
+            the first of its peers, the other cells. It takes the recipe, too, unless it is given a
+            recipe, reducer or model, or the peer was given an object as reducer or model.
 
         Returns
         -------
@@ -430,10 +434,10 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         Raises
         ------
         SettingError
-            If a given setting differs from the used store's, is unknown, or is out of range, if an
-            object of yours is missing or is another one than the engine had, and if a stored recipe
-            cannot be read. A store that was opened here is then closed; an `SqlStore` that was
-            passed may be, too.
+            If a given setting differs from the used store's, contradicts that of a peer, is
+            unknown, or is out of range, if an object of yours is missing or is another one than the
+            engine had, and if a stored recipe cannot be read. A store that was opened here is then
+            closed; an `SqlStore` that was passed may be, too.
         StoreError
             If another engine owns the cell, the store cannot be used, or this dengine cannot
             restore its newest version (in rare cases KeyError, ValueError or NotImplementedError).
@@ -462,15 +466,15 @@ class DataEngine(AbstractContextManager["DataEngine"]):
     def close(self) -> None:
         """Finish a retrain under way, within seconds, write everything, and close the store.
 
-        A retrain that takes longer than 5 s is dropped. In a product the news of the other cells is
-        taken in before; if it has a correction or a rollback, or the store does not answer, a
-        retrain that is not in force yet is lost. A second call does nothing, nor does one in a
-        forked process. Records that only the database does not take stay in the journal. Records
-        that the disk does not take are given up, and an error is logged; no call has said that they
-        are on disk. If the disk hangs, the store stays open, and no other engine can own the cell
-        until the process ends. With `replaying=True` this waits for the disk and the database
-        without a time limit. A store in memory stays open. Raises StoreError while another thread
-        uses the engine.
+        A training that is not done 5 s after this call is dropped. In a product the news of the
+        other cells is taken in before; if it has a correction or a rollback, or the store does not
+        answer, a retrain that is not in force yet is lost. A second call does nothing, nor does one
+        in a forked process. Records that only the database does not take stay in the journal.
+        Records that the disk does not take are given up, and an error is logged; no call has said
+        that they are on disk. If the disk hangs, the store stays open, and no other engine can own
+        the cell until the process ends. With `replaying=True` this waits for the disk and the
+        database without a time limit. A store in memory stays open. Raises StoreError while another
+        thread uses the engine.
         """
         with self._exclusive:
             if self._outbox.is_usable:
@@ -513,19 +517,22 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         Parameters
         ----------
         trace : array, shape (samples,) or (channels, samples)
+            The first trace without a fault sets the `TraceSpec`, if none is in force.
         part : str or int, optional
             The part's number. The labels of a part that comes again count less than those of
             different parts, and not at all for this part itself.
         decision_id : str, optional
             An id that the caller chooses. The same id and trace always have the same decision, and
-            an ACCEPT or REJECT is on disk when this returns.
+            an ACCEPT or REJECT is on disk when this returns. None: a new id is made, and the call
+            does not wait for the disk.
         timed_out : bool, default False
             The caller, who gave an id, does not wait any more and verifies the part. Record this as
-            VERIFY with `Reason.LATE`, without asking the model. None of the steps above is done,
-            and rule and model learn nothing of it. If the trace or the store has a fault, this
-            fault is the reason instead. Any thread may make this call, also while another thread
-            uses the engine; it waits for the disk, but not for that thread. With a store in memory,
-            and while no `TraceSpec` is in force, the VERIFY is not recorded.
+            VERIFY with `Reason.LATE`, without asking the model. If the id has a decision already,
+            that decision is returned, whatever it is. None of the steps above is done, and rule and
+            model learn nothing of it. If the trace or the store has a fault, this fault is the
+            reason instead. Any thread may make this call, also while another thread uses the
+            engine; it waits for the disk, but not for that thread. With a store in memory, or while
+            no `TraceSpec` is in force, the VERIFY is not recorded.
 
         Returns
         -------
@@ -568,10 +575,12 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         These are the steps. The trace is converted, so that a wrong trace raises before it could
         confirm an earlier part. A rule that lacks a correction is put right. Accepted parts that
         nobody reported are confirmed (with `stops="all"`) or counted, which may change the rule.
-        The decision is made and recorded. With an id it must be on disk before the caller acts on
-        it; if the disk does not take it, the decision becomes VERIFY. Without an id one is made.
-        Checks that are overdue are counted. Raises what `DecisionMaker.convert` raises, before
-        anything else is done.
+        The decision is made and recorded; without a `decision_id` it gets a new id. With a
+        `decision_id` the call waits until the decision is on disk; if the disk does not take it in
+        time, an ACCEPT or REJECT becomes VERIFY. The decision is then noted as a check or an
+        outcome that is waited for, and checks that are overdue count as wrong decisions, which may
+        change the rule, too. Raises what `DecisionMaker.convert` raises, before anything else is
+        done.
         """
         x = self._maker.convert(trace)
         self._learner.catch_up()
@@ -594,7 +603,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         and the other cells' news is left for later. If a report or the next decision had confirmed
         the part as good already, the call also waits for the store, so that the rule is corrected
         now; if the store does not answer, this happens later. For such a correction a training
-        under way is discarded and begins again, and a baseline is retrained.
+        under way is discarded and begins again, and a model that cannot take a label back, like a
+        handed-in model, is retrained in this thread, or, if it is pinned, fitted again.
 
         Parameters
         ----------
@@ -613,12 +623,12 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         Raises
         ------
         ReportError
-            For an unknown id, a second report on the decision, or an invalid label.
+            For an unknown or invalid id, a second report on the decision, or an invalid label.
         StoreError
             If it is not certain that the label is on disk (NotTakenError): it is learned all the
-            same, and the same report may come again. If the id cannot be looked up: nothing is
-            learned. Also for an engine that is closed, was opened for reading or before a fork, or
-            is in use by another thread.
+            same, and the same report may come again. If the id cannot be looked up, or the stored
+            trace is damaged: nothing is learned. Also for an engine that is closed, was opened for
+            reading or before a fork, or is in use by another thread.
         Exception
             What the copying of a handed-in model raises, before a retrain; the label is on disk
             then.
@@ -774,7 +784,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
             the executor, and return None. If a retrain is under way, nothing is begun, and a
             trained version is taken one step further (in a product, all steps); if the executor
             cannot begin yet, `poll` or `report` begins it. `poll` brings it to its end.
-            Without an executor it runs in this thread, and its report is returned.
+            Without an executor, or if the executor takes no work because it died or hangs, the
+            retrain runs in this thread, and its report is returned.
 
         Returns
         -------
@@ -794,17 +805,16 @@ class DataEngine(AbstractContextManager["DataEngine"]):
             return self._learner.retrain(wait)
 
     def poll(self, brief: bool = False) -> RetrainReport | None:
-        """Do between two parts what is due: put a trained version in force, retrain, announce a
-        safe mode.
+        """Put a trained version in force, retrain if that is due, and announce a safe mode.
 
         `run` calls it after each part. In a loop of your own `decide` and `report` together do the
         same, but each takes a version that the executor has trained only one step further (the
         steps are test, store, put in force). A training that is not done is not waited for. Without
         an executor a retrain that is due runs here, also with `brief`. Before a retrain begins,
         also one in the executor, the call waits until the store has all labels; if it does not take
-        them in time, the retrain waits for a later call. In a product, newer versions and
-        corrections of the other cells are put in force, which are looked for once a second. If a
-        safe mode began or ended, an event is recorded, and `on_safe_mode` is called.
+        them in time, or has a fault, the retrain waits for a later call. In a product, newer
+        versions and corrections of the other cells are put in force, which are looked for once a
+        second. If a safe mode began or ended, an event is recorded, and `on_safe_mode` is called.
 
         Parameters
         ----------
@@ -883,8 +893,9 @@ class DataEngine(AbstractContextManager["DataEngine"]):
 
         Before that, everything is written to the disk, and to the store if it answers (`flush`);
         what the store does not take in time does not count. Decisions since the last change of
-        policy count. Raises NotTakenError if not everything is on disk in time, and StoreError if
-        the store cannot be read.
+        policy count. With `stops="all"` accepted parts of unknown outcome are left out. A forgotten
+        label and an overdue audit count as wrong decisions. Raises NotTakenError if not everything
+        is on disk in time, and StoreError if the store cannot be read.
         """
         self.flush()
         policy = self.policy
@@ -989,13 +1000,14 @@ def _new_settings(
 ) -> tuple[EngineSettings, EngineModel]:
     """Return the settings of a new engine, and the untrained model that they describe.
 
-    `given` holds the settings that the caller passed beside the recipe, by name; None is not given.
-    For a handed-in `model` without a recipe, the other settings are those of the default recipe,
-    but `retrain_every` is that of `Reducer`, not of conv. Raises SettingError if `reducer`, or a
-    setting in `given`, has no effect on such a model; those in `recipe` are not refused. Raises it
-    also for settings that are out of range or contradict each other, if the reducer or the rule
-    cannot be made, for a `model` that is none, and if the training window is smaller than the
-    model's `min_traces`.
+    `given` holds the settings that the caller passed beside the recipe, by name. They replace those
+    of the recipe; None is not given. For a handed-in `model` without a recipe, the other settings
+    are those of the default recipe, but `retrain_every` is that of `Reducer`, not of conv. Raises
+    SettingError if `reducer`, or a setting in `given`, has no effect on such a model; those in
+    `recipe` are not refused. Raises it also for settings that are out of range or contradict each
+    other, if the reducer or the rule cannot be made, for a `model` that `BaselineAdapter` refuses,
+    and if the training window is smaller than the model's `min_traces`. Other errors of the
+    constructor of a user's class are raised as they are.
     """
     if model is not None:
         check_model_settings(reducer, given)

@@ -104,9 +104,10 @@ class Feedback:
         The model in force and its rule must be restored before. Overdue checks and checks from
         before the present rule are left out, as are accepted parts from before the present policy.
         With `stops="all"` the accepted parts are kept, so that the next trace confirms them. With
-        "some" they are only counted, as unreported since the last label. For a safe mode that the
-        rule is in already, the user's function `on_safe_mode` is not called. Raises StoreError if
-        the store cannot be read, or with `stops="all"` the trace of such a part is damaged.
+        "some" they are only counted, as unreported since the last label. A safe mode that the rule
+        is in already is not announced again, by no event and no call of the user's function
+        `on_safe_mode`. Raises StoreError if the store cannot be read, or with `stops="all"` the
+        trace of such a part is damaged.
         """
         self._safe_mode = self._live.newest.safe_mode
         store = self._outbox.store
@@ -156,10 +157,10 @@ class Feedback:
     def take_in(self, stored: StoredDecision, success: bool) -> None:
         """Learn a reported label and hand it to the outbox, without waiting for the disk.
 
-        `stored` is the decision with the label that it has so far, if any. If the same report comes
-        again before its label is known to be on disk (`note_synced`), nothing is done. If the
-        decision has a label already, ReportError is raised, with one exception: a line stop may
-        follow the confirmation of a part, by a report or by the next decision
+        `stored` is the decision with the label that it has so far, on disk or not, if any. If the
+        same report comes again before its label is known to be on disk (`note_synced`), nothing is
+        done. If the decision has a label already, ReportError is raised, with one exception: a line
+        stop may follow the confirmation of a part, by a report or by the next decision
         (`Policy(stops="all")`). Such a line stop is recorded, and learned later, as a correction.
         The attribute `remedy` is set if the rule must be rebuilt, which is not done here. An
         exception of rule or model is logged, not raised.
@@ -267,9 +268,10 @@ class Feedback:
 
         A product is several cells whose labels have one sequence of numbers in the store. With or
         without a product, the rule first counts each check that has become overdue as a wrong
-        decision; if this fails, it is logged, and the rule is stale. The store is not asked: these
-        are the numbers that came with the labels drained so far. Labels of traces with a fault are
-        passed over, and without a model that answers no reference changes. Nothing is raised.
+        decision; if this fails, it is logged, and the rule is stale. The store is not asked: the
+        outbox keeps the numbers of the labels that it has written to the store, and gives each
+        number once. Labels of traces with a fault are passed over, and without a model in force no
+        reference changes. Nothing is raised.
         """
         self._count_overdue()
         if not self._provisional:
@@ -339,9 +341,9 @@ class Feedback:
         of a safe mode that began, or "" if it ended; then the event says `reason_ended`. A safe
         mode begins after an alarm of the rule. If another alarm changes the reason of a safe mode,
         it is announced once more, as one that began. What changed and changed back between two
-        calls is not announced. If recording the event or the user's function fails, that is logged
-        and not tried again; callers do this only after labels are stored, so that such a failure
-        costs no label.
+        calls is not announced. If the event cannot be recorded, the user's function is not called.
+        This, like an exception of the function, is logged, and nothing is tried again. Callers do
+        this only after labels are stored, so that such a failure costs no label.
         """
         safe_mode = self._live.newest.safe_mode
         if safe_mode == self._safe_mode:

@@ -12,9 +12,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..errors import StoreError, log
+from ..errors import StoreError, VersionError, log
 from ..store.outbox import Outbox
-from ..store.records import VersionError
 from .guard import NOT_READY, guarded
 from .live_model import LiveModel
 from .resume import ChangedTracesError, add_labels_since, restore_model
@@ -57,9 +56,9 @@ class Peers:
         """Return the numbers of the product's newest version and of its newest correction.
 
         The first is 0 if there is no version that is newer than the one in force; a version that
-        could not be put in force does not count. Raises StoreError if the store gives no answer in
-        time. Whatever comes of it, the next look is due LOOK_SECONDS (1 s) after this one began
-        (`is_look_due`).
+        could not be put in force does not count. Raises StoreError if the store fails or gives no
+        answer in time. Also after an error, the next look is due LOOK_SECONDS (1 s) after this one
+        began (`is_look_due`).
         """
         self._looked = self._clock()
         store = self._outbox.store
@@ -86,13 +85,14 @@ class Peers:
         self._is_lost = error is not None
 
     def read_labels(self) -> None:
-        """Add the labels of all cells that came since the window's newest to the training window.
+        """Add to the training window all cells' labels that came after its newest label.
 
-        At most as many as the window holds are read, the newest, with the corrections that the
-        references of the model in force have; a full window loses its oldest. Labels of traces with
-        a fault and forgotten labels are left out, and so are those of damaged traces, for which an
-        event is written to the store. There is no time limit. Raises StoreError if the store cannot
-        be read.
+        If more labels came than the window holds, only the newest are read. They are read with the
+        corrections up to `LiveModel.corrected_to`; a full window loses its oldest label. Labels of
+        traces with a fault and forgotten labels are left out, and so are labels of damaged traces,
+        for which an event is written to the store. There is no time limit. Raises StoreError, and
+        adds nothing, if the store cannot be read, the traces have different shapes, or a label is
+        neither 0 nor 1.
         """
         labelled = self._outbox.store.labels.with_traces(
             self._window.capacity,
@@ -107,12 +107,18 @@ class Peers:
 
         It gets the present decision rule of this cell: nothing is rebuilt, and the other cell's
         rule is ignored. A failure to take over the rule is logged, and the version is in force all
-        the same. If the version is damaged or not kept, or if the model raises an error that is no
-        StoreError, that is logged, the present version stays in force, and `look` does not return
-        this number again. A model like
-        umap-learn is fitted again, and the labels that it is fitted on are checked against the
-        ledger. Returns whether the version is in force now. Raises StoreError if the store cannot
-        be read, and for a state that this dengine cannot restore.
+        the same. This cell's labels since the version become its references, and corrections since
+        then are applied (`add_labels_since`), without a time limit. A damaged trace is reported by
+        an event in the store.
+
+        A model like umap-learn is fitted again. The labels that it is fitted on are checked against
+        the ledger; a difference sets the outbox's `integrity_error`, after which every part is
+        verified. If one of these traces is damaged or missing, if the version is damaged, not kept
+        or of another model, or if the model raises an error that is no StoreError, that is logged,
+        the present version stays in force, and `look` does not return this number again.
+
+        Returns whether the version is in force now. Raises StoreError if the store cannot be read;
+        `look` then returns the number again.
         """
         store = self._outbox.store
         try:

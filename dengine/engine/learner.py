@@ -94,14 +94,16 @@ class Learner:
     def resume(self, label_within: int, policy_since: int) -> None:
         """Restore training window, version, rule and counts from the store.
 
-        It is called when an engine opens the store. The version is restored bit for bit; but a
-        model of which the store has only the numbers of its traces is trained on them again, and if
-        one of these is damaged or missing, no model is in force. A difference to the ledger sets
-        the outbox's `integrity_error`. `label_within` is the number of later decisions after which
-        a check without a report is overdue, and `policy_since` the first version under the policy
-        in force. If a model is in force, or the training window has at least IMPORTED labels (500),
-        this also starts a thread that computes in advance for the next retrain (`precompute`).
-        Raises StoreError if the store cannot be read, and the other errors of `LiveModel.resume`.
+        It is called when an engine opens the store. The newest version whose arrays are intact is
+        restored bit for bit; but a model of which the store has only the numbers of its traces is
+        trained on them again, and if one of these is damaged or missing, no model is in force.
+        Damaged arrays and traces are reported by events in the store. A difference between store
+        and ledger (its hash chain) sets the outbox's `integrity_error`. `label_within` is the
+        number of later decisions after which a check without a report is overdue, and
+        `policy_since` the first version under the policy in force. If a model is in force, or the
+        training window has at least IMPORTED labels (500), this also starts a thread that computes
+        in advance for the next retrain (`precompute`). Raises StoreError if the store cannot be
+        read, and the other errors of `LiveModel.resume`.
         """
         version = self._store.versions.newest()
         reports = self._store.versions.retrains()
@@ -145,15 +147,16 @@ class Learner:
     def catch_up(self) -> None:
         """Give labels the numbers that the store assigned, and put the rule right if it must be.
 
-        The store assigns numbers only in a product. Checks that have become overdue are counted,
-        too. The rule must be put right (`Feedback.remedy`) after it learned a wrong outcome: it is
-        rebuilt, or all corrections that the store has by now are applied and it is rebuilt. This
-        waits for a later call while the store lacks any record or has a fault. Before a correction
-        a retrain under way is ended (`end_training`), and the store is checked against its ledger:
-        after a difference every part is verified. A model that cannot change its references is
-        retrained here, or, if it is pinned, fitted again. Nothing is raised: if the store fails
-        meanwhile, that is logged, and a later call tries again; any other exception, as of a model
-        that is fitted again, is logged, and it is not tried again.
+        The store assigns numbers only in a product (cells that share labels and versions). Checks
+        that have become overdue are counted, too. The rule must be put right (`Feedback.remedy`)
+        after it learned a wrong outcome: it is rebuilt, or all corrections that the store has by
+        now are applied and it is rebuilt. This waits for a later call while the store lacks any
+        record or has a fault. Before a correction a retrain under way is ended (`end_training`),
+        and the store is checked against its ledger (its hash chain): after a difference every part
+        is verified. A model that cannot change its references is retrained here, or, if it is
+        pinned, fitted again. Nothing is raised: if the store fails meanwhile, that is logged, and a
+        later call tries again; any other exception, for example of a model that is fitted again, is
+        logged, and it is not tried again.
         """
         self.feedback.number_labels()
         if self.feedback.remedy is None or not self._outbox.is_drained or self._outbox.fault:
@@ -190,9 +193,9 @@ class Learner:
 
         First every label is stored, since a version is trained only on labels that the store has
         numbered. Then the call waits for what is computed in advance, and takes in what the
-        product's other cells stored (a newer version, corrections and labels), since either may
+        product's other cells stored (a newer version, corrections and labels), since these may
         change what the training starts from. Then new labels count from zero, and the training
-        begins.
+        begins. Whether a rollback pinned the version in force is not checked.
 
         With `wait` True, or if no executor takes work (none is there, or it died or hangs), all is
         done in this thread, which then has one torch thread, and the report is returned. Otherwise
@@ -205,8 +208,8 @@ class Learner:
         is stored, but labels that came since cannot be, it is put in force by a later call; its
         report is returned all the same. Raises StoreError if the labels before the training cannot
         be stored, and in a product if the store does not answer; no training begins then. What the
-        copying of a handed-in model raises is raised; no label counts as new then. With
-        `wait` True no training may be under way (`end_training`).
+        copying of a model that the user handed in raises is raised; no label counts as new then.
+        With `wait` True no training may be under way (`end_training`).
         """
         if not wait:
             if self.is_at_work:
@@ -234,11 +237,12 @@ class Learner:
         """Retrain, or begin to, if there is a reason for it.
 
         There are three reasons. First, `retrain_every` labels are new, and there are as many labels
-        as the model needs for a training (`min_traces`). Second, the time budget ended the training
-        of the version in force before its last step; this is a reason only in a cell without a
-        product, and only if the last retrain was not dropped. Third, a retrain was requested
-        earlier and could not begin then, or a training was discarded and is to begin again. A
-        pinned version is not replaced, and such a request is withdrawn.
+        as the model needs for a training (`min_traces`). Second, the training of the version in
+        force made some of its steps and not all, for example because the time budget ended it; this
+        is a reason only in a cell without a product, and only if the last retrain was not dropped.
+        Third, a retrain was requested earlier and could not begin then, or a training was discarded
+        and is to begin again. A pinned version is not replaced, and such a request is withdrawn.
+        What the copying of a model that the user handed in raises is raised.
 
         In a product a newer version and corrections of other cells are put in force first, so a
         peer's version may be in force afterwards, even if nothing is trained here. They are looked
@@ -324,7 +328,8 @@ class Learner:
         With `to_the_end` all steps of a training that is done are taken, and the call waits for the
         store. Nothing happens if no training is under way, or while it is not done; but a training
         that hangs (longer than 60 s), or whose executor died, is given up and dropped. A version
-        that cannot be stored is dropped, and nothing is raised.
+        that cannot be stored is dropped. A version that is stored, but lacks newer labels that the
+        store does not take now, waits for a later call. Nothing is raised.
 
         `wait` is the number of seconds to wait for a training that is not done; after that it is
         given up, and so is a training that hangs. In a product (cells that share labels and
@@ -441,8 +446,9 @@ class Learner:
         only the report is stored, and the previous version stays in force.
 
         Yields after each step: None, or, if the store has not done its part yet, a function that
-        waits for it. Raises StoreError if the version cannot be stored. The functions that it
-        yields raise StoreError if the labels cannot.
+        waits for it. If the store has not begun to commit the version within the outbox's `limit`,
+        the step itself waits for it. Raises StoreError if the version cannot be stored. The
+        functions that it yields raise StoreError if the labels or the version cannot be stored.
         """
         candidate.check()
         yield None
@@ -456,14 +462,14 @@ class Learner:
         self._swap(candidate)
 
     def _catch_up_candidate(self, candidate: Candidate) -> Iterator[Callable[[], object] | None]:
-        """Make all labels that came references of the candidate, one a step, and have them stored.
+        """Add all labels that it lacks to the candidate's references, and have them stored.
 
-        The candidate is a trained version that is not in force yet. Each round first counts overdue
-        checks and, in a product, takes over the labels' numbers (`number_labels`). It yields
-        None after each label, and a function that waits for the store if labels are not stored yet;
-        it ends when no label is missing or waits to be stored. In a cell that never pauses some
-        label always waits, so in every 20th round this call waits for the store itself; a
-        StoreError there is ignored.
+        The candidate is a trained version that is not in force yet; a label that it cannot take is
+        logged and skipped. Each round first counts overdue checks and, in a product, takes over the
+        labels' numbers (`number_labels`). It yields None after each label, and a function that
+        waits for the store if labels are not stored yet; it ends when no label is missing or waits
+        to be stored. In a cell that never pauses some label always waits, so in every 20th round
+        this call waits for the store itself; a StoreError there is ignored.
         """
         for n_waits in count(1):
             self.feedback.number_labels()
@@ -562,12 +568,13 @@ class Learner:
 
         If there is a newer version or correction, or with `with_labels`, this cell's labels are
         stored first, and the labels of all cells are read into the training window at the end. What
-        is read is checked against the ledger; a difference sets the outbox's `integrity_error`,
-        after which every part is verified. A pinned version or a correction discards a training
-        under way in the executor. A model that cannot change the reference of a peer's correction
-        is not retrained here. After a newer version the new labels are counted from those that it
-        knows. Nothing happens in a cell without a product. Raises StoreError if the store is
-        unavailable.
+        is read is checked against the ledger (the store's hash chain); a difference sets the
+        outbox's `integrity_error`, after which every part is verified. A version that cannot be
+        used is logged, and the present version stays in force (`Peers.put_in_force`). A pinned
+        version or a correction discards a training under way in the executor. A model that cannot
+        change the reference of a peer's correction is not retrained here. After a newer version the
+        new labels are counted from those that it knows. Nothing happens in a cell without a
+        product. Raises StoreError if the store is unavailable.
         """
         peers = self._peers
         if peers is None:
@@ -608,12 +615,12 @@ class Learner:
         thread, or, if it is pinned, fitted again as a new version; only the cell that corrected
         does so, and no training may be under way then (`end_training`). If the next training does
         not start from the model in force, because labels were forgotten, its features are computed
-        in advance (`_precompute_other_start`). The store is checked against its ledger; a
-        difference sets the outbox's `integrity_error`, after which every part is verified. A
-        damaged trace is reported by an event in the store. With no new correction the window is
-        read and the rule rebuilt, too; a baseline is then retrained all the same. Raises StoreError
-        if the store is unavailable, and, for a pinned model that is fitted again, what `roll_back`
-        raises.
+        in advance (`_precompute_other_start`). The store is checked against its ledger (its hash
+        chain); a difference sets the outbox's `integrity_error`, after which every part is
+        verified. A damaged trace is reported by an event in the store. With no new correction the
+        window is read and the rule rebuilt, too; a baseline (a model that the user handed in) is
+        then retrained all the same. Raises StoreError if the store is unavailable, and what
+        `retrain` raises, or, for a pinned model that is fitted again, `roll_back`.
         """
         self._outbox.check_integrity(0)  # the rule is rebuilt from all of it
         corrections = self._store.corrections.after(self.live.corrected_to)
@@ -635,10 +642,10 @@ class Learner:
 
         This can be so after a label was forgotten: the training then starts from an earlier version
         or from initial weights. A thread computes what that model needs of the traces in the
-        training window, and keeps it in that model; a failure is logged. Without an executor the
-        retrain would wait for the thread, and this would count against its time budget; so this
-        call waits for it. Without labels, and while an earlier thread still works, nothing is
-        begun.
+        training window, and keeps it in that model; a failure is logged. Without labels, and while
+        an earlier thread still works, nothing is begun. Without an executor the retrain would wait
+        for the thread, and its report would count these seconds; so this call waits for the thread,
+        also for an earlier one.
         """
         if self._choose_start() is self.live.newest:
             return
@@ -651,10 +658,10 @@ class Learner:
     def release(self, author: str) -> Change:
         """Let retrains replace a version again that a rollback pinned, and return the stored event.
 
-        The same model, with its rule, goes on as a new version, and the newest report is one of
-        this version. It is not checked that a version is pinned. If that cannot be stored, or
-        another cell of the product stored a version meanwhile, StoreError is raised and nothing
-        changes.
+        The same model, with its rule, goes on as a new version, of which `take_report` then returns
+        a report. It is not checked that a version is pinned. If the new version cannot be stored,
+        also because another cell of the product stored one meanwhile, StoreError is raised and
+        nothing changes.
         """
         live = self.live
         text = f"version {live.version} is pinned no more: the next retrain may replace it"
@@ -667,17 +674,19 @@ class Learner:
         """Put the earlier version `number` in force again, as a new version that is pinned.
 
         No training may be under way (`end_training`). The version is stored together with `event`,
-        and the newest report is one of it. Until then nothing changes, so all that can fail comes
-        before: checking the store against its ledger, reading the version, restoring it, and adding
-        the later labels, up to the training window's capacity, as its references. A difference from
-        the ledger sets the outbox's `integrity_error`, and a damaged trace is reported by an event
-        in the store. Once it is in force, new labels count from zero, since the version knows all
-        labels until now. A retrain that was requested before is not begun any more. If the next
-        training starts from another model, a thread begins to precompute for it; without an
-        executor this call waits for the thread.
+        and `take_report` then returns a report of it. Until it is stored nothing changes, so all
+        that can fail comes before: checking the store against its ledger (its hash chain), reading
+        the version, restoring it, and adding the later labels, up to the training window's
+        capacity, as its references. A difference from the ledger sets the outbox's
+        `integrity_error`, and a damaged trace is reported by an event in the store. Once it is in
+        force, new labels count from zero, since the version knows all labels until now. A retrain
+        that was requested before is not begun any more. If the next training starts from another
+        model, a thread begins to precompute for it; without an executor this call waits for the
+        thread.
 
-        A baseline, which is fitted again, gets the labels as they count now, since it cannot take
-        a label back. An exception as the model takes over the rule in force is logged.
+        A baseline (a model that the user handed in), which is fitted again, gets the labels as they
+        count now, since it cannot take a label back. An exception as the model takes over the rule
+        in force is logged.
 
         Raises StoreError if the version is not kept or is damaged, if a trace is damaged that the
         model must be fitted on again, and if the version cannot be stored, also because another
@@ -704,12 +713,14 @@ class Learner:
     def set_policy(self, policy: Policy | None, evidence: EvidenceWindow, event: Change) -> None:
         """Go on under another policy, as a new version of the same model.
 
-        The version is stored with `event`, and the newest report is one of it. With `policy` the
-        decision rule starts anew and counts the decisions that `evidence` names. With None only
-        settings outside the model have changed, and its rule goes on. Before the first retrain only
-        the event is stored. A failure to make the model with the new rule ready is logged. Raises
-        SettingError if the rule cannot be made, and StoreError if the event cannot be stored, also
-        because another cell of the product stored a version meanwhile: then nothing changes.
+        The version is stored with `event`, and `take_report` then returns a report of it. With
+        `policy` the decision rule starts anew and counts the decisions that `evidence` names. With
+        None only settings outside the model have changed, and its rule goes on. Before the first
+        retrain only the event is stored. A failure to make the model with the new rule ready is
+        logged. Raises SettingError if the rule cannot be made, or the recipe of another cell of the
+        product cannot be read; StoreError if the event cannot be stored, also because another cell
+        of the product stored a version meanwhile; and what the constructor of a user's rule raises,
+        except TypeError. After each of these errors nothing is changed.
         """
         live = self.live
         template = live.template
@@ -729,9 +740,9 @@ class Learner:
     ) -> None:
         """Store a model as the next version, with the event of a person's change; put it in force.
 
-        The newest report is then one of this version: accepted, with `reason` and `seconds`, which
+        `take_report` then returns a report of it, accepted, with `reason` and `seconds`; this
         empties `dropped`. If the version cannot be stored, also because another cell of the product
-        stored one meanwhile, StoreError is raised and nothing changes.
+        stored a version meanwhile, StoreError is raised and nothing changes.
         """
         n_traces = len(trained_on.seq)
         report = RetrainReport(self.live.next_version, seconds, n_traces, 0, True, reason)

@@ -115,12 +115,14 @@ class LiveModel:
         force, and the rule of the untrained model is updated with the stored outcomes since it
         began. The outcomes that update the rule, and the labels of such a training, are checked
         against the store's ledger; a difference sets the outbox's `integrity_error`, after which
-        every part is verified. A damaged trace is reported by an event in the store. Labels
-        that came after the version was stored become references. If the version is from before the
-        present rule, its stored rule is not taken. If the stored rule does not include what it must
-        (`RuleProgress.last_seq`), the rule is rebuilt from all outcomes. An exception as the model
-        is made ready, or as the rule or the references learn, is logged. `overdue`, `overdue_to`
-        and `corrected_to` are restored, too.
+        every part is verified. A damaged trace is reported by an event in the store. Labels that
+        came after the version was stored become references, in a product only the labels of this
+        cell, and corrections since then are applied (`add_labels_since`). If the version is from
+        before the present rule, its stored rule is not taken. If the stored rule does not include
+        what it must (`RuleProgress.last_seq`), the rule is rebuilt from all outcomes. An exception
+        as the model is made ready, or as the rule or the references learn, is logged; an exception
+        of the rule also makes it stale, so that every part is verified. `overdue`, `overdue_to` and
+        `corrected_to` are restored, too.
 
         Parameters
         ----------
@@ -320,13 +322,15 @@ class LiveModel:
     def apply_corrections(self, corrections: Sequence[Correction]) -> bool:
         """Apply the store's newest corrections to the references of the model in force.
 
-        Returns False if the model must be trained again: always for a baseline (a model that the
-        user handed in), and if it cannot change a reference; the other references are changed all
-        the same. The caller must retrain then, because each correction is applied only once.
-        Returns True before the first retrain. `corrected_to` is set to the last correction that was
-        applied, also if this raises; without any it stays. A damaged trace is reported by an event
-        in the store. The rule is left to `rebuild_rule`. Raises StoreError if the store is
-        unavailable, after the corrections before were applied.
+        `corrections` must be all after `corrected_to`, in their order. Returns False if the model
+        must be trained again: always for a baseline (a model that the user handed in), and if it
+        cannot change a reference; the other references are changed all the same. The caller must
+        retrain then, because each correction is applied only once. Returns True before the first
+        retrain. An error of the model as it takes a reference again is logged, and the result does
+        not tell of it. `corrected_to` is set to the number of the last correction that was applied,
+        also if this raises; without any it stays. A damaged trace is reported by an event in the
+        store. The rule is left to `rebuild_rule`. Raises StoreError if the store is unavailable;
+        the corrections before the one that failed stay applied.
         """
         store = self.outbox.store
         is_done = self.newest.keeps_references or self.answering is None

@@ -34,21 +34,21 @@ def restore_model(
     *,
     with_rule: bool = False,
 ) -> EngineModel:
-    """Return a new model, made from the untrained model `template`, as a stored version was.
+    """Return a new model in the state of a stored version, made from the untrained `template`.
 
-    A model like umap-learn, of which not the fit but only the numbers of its traces are stored, is
-    trained again: on the traces of `trained_on`, with the labels as they were after the correction
-    that it names. The labels are first compared with the ledger, the store's hash chain. A
-    difference sets the outbox's `integrity_error`, after which every part is verified, and the
-    model is trained nevertheless. A trace whose label was forgotten by then is left out, and does
-    not count as missing. The new model and the template share one rule, so with `with_rule` the
-    template gets the stored rule, too, if the version holds one.
+    A model whose fit is not stored, but only the numbers of its traces, like umap-learn or a
+    baseline, is trained again: on the traces of `trained_on`, with the labels as they were after
+    the correction that `trained_on` names. The labels are first compared with the ledger, the
+    store's hash chain. A difference sets the outbox's `integrity_error`, after which every part is
+    verified, and the model is trained nevertheless. A trace whose label was forgotten by then is
+    left out, and does not count as missing. The new model and the template share one rule, so with
+    `with_rule` the template gets the stored rule, too, if the version holds one.
 
     Raises ChangedTracesError if one of these traces is missing or damaged; an event is written to
-    the store that names the damaged ones. Raises StoreError (KeyError, ValueError or
-    NotImplementedError, if it is of another reducer) for a state that this dengine cannot restore,
+    the store that names the damaged ones. Raises StoreError, KeyError, ValueError or
+    NotImplementedError for a state that cannot be restored, like that of another reducer;
     StoreError for a label that is neither 0 nor 1, for traces of different shapes, and if the store
-    does not answer, and what the training raises.
+    does not answer; and what the training raises.
     """
     state = version.state if with_rule else without_rule(version.state)
     model = template.successor()
@@ -140,19 +140,21 @@ def add_labels_since(
     capacity: int,
     shared_to: int | None = None,
 ) -> int:
-    """Add the labels since a version to its restored model as references, if they are none yet.
+    """Add the labels since a version, as references, to its restored model, if it lacks them.
 
-    They came after the newest label that the version was trained on, or got with a rollback.
-    They are the labels of all cells of the product up to number `shared_to`, and after it only this
-    cell's own. None stands for the newest label that the version was trained on, or that it got
-    with a rollback, so that an engine that opens a store counts what it counted before. At most the
-    `capacity` newest of each of the two kinds are read. Corrections that came since the version was
+    Let N be the number of the newest label that the version was trained on, or that it got with a
+    rollback. The labels are those after N; a baseline (a model that the user handed in) gets those
+    after the newest label that it was trained on. Up to number `shared_to` they are those of all
+    cells of the product, and after it only this cell's own. None stands for N, so that an engine
+    that opens a store counts what it counted before. At most the `capacity` newest of the shared
+    labels are read, and as many of the cell's own. Corrections that came since the version was
     stored are applied between the labels, in the order in which they came, so that the model is the
     same bit for bit. A correction that the model cannot take (`apply_correction` returns False) is
-    skipped without a message. A baseline (a model that the user handed in), which cannot be
-    corrected, gets the labels as they count now. A label that the model cannot take is logged and
-    skipped; one whose trace is damaged is skipped, and an event is written to the store. Returns
-    the number of the newest correction in the store. Raises StoreError if the store cannot be read.
+    skipped without a message. A baseline, which cannot be corrected, gets the labels as they count
+    now. A label that the model cannot take is logged and skipped; one whose trace is damaged is
+    skipped, and an event is written to the store. Returns the number of the newest correction in
+    the store. Raises StoreError if the store cannot be read, for a label that is neither 0 nor 1,
+    and for traces of different shapes.
     """
     corrected_to = int(version.state.get("corrected_to", 0))
     # A baseline cannot be corrected afterwards, so it gets each label as it counts now; another

@@ -108,7 +108,8 @@ class EngineSettings:
 
         Settings at their defaults are left out, except the recipe, which is written in full, and
         the seed; dengine's own version is added. Raises SettingError if a named reducer's class
-        must be imported for a default of the recipe, and cannot be.
+        must be imported for a default of the recipe, and cannot be, or if that default is out of
+        range.
         """
         texts = {"recipe": self.recipe.to_toml(), "seed": str(self.seed), "dengine": __version__}
         objects = {"model": self.model, "described": self.described}
@@ -156,10 +157,11 @@ class EngineSettings:
             For an unused store, a number that is negative or no number, a damaged `TraceSpec`, and
             a recipe that lacks settings.
         SettingError
-            If the stored text is no recipe, if an object is missing or differs from the one that
-            the engine was made with, or if a `model` is passed to an engine that has its own, or
-            lacks a method of `Model`. Also for a stored seed that is too large, and force limits
-            that do not fit the `TraceSpec`.
+            If the stored text is no recipe, if an object is missing or differs from the object that
+            the engine was made with, if a text `reducer` is neither a name in `RECIPES`, a TOML
+            file of a recipe nor `module:Class`, or if a `model` is no baseline or is passed to an
+            engine that has its own. Also for a stored seed that is too large, and force limits that
+            do not fit the `TraceSpec`.
         ImportRefusedError
             If the recipe names a class that may not be imported.
         """
@@ -200,8 +202,9 @@ class EngineSettings:
         If a user passed an object in place of a name, the settings are a copy that describes it.
         For a `model`, a baseline, the recipe stays, though not all of it has an effect. Without one
         the recipe's reducer and the rule of its policy are made, for which classes of the user's
-        are imported. Raises SettingError if that fails, and for a `model` that is no baseline.
-        These settings are not changed.
+        are imported. Raises SettingError if they cannot be made, and for a `model` that is no
+        baseline; other errors of the constructor of a user's class are raised as they are. These
+        settings are not changed.
         """
         if model is None:
             untrained = ModelPrediction.from_recipe(self.recipe, self.seed)
@@ -223,9 +226,10 @@ class EngineSettings:
 
         Not compared are the shadow mode, and force limits that the program leaves out, because an
         operator sets both while the cell runs. Nor is a reducer that is an object, with its
-        parameters. A `trace` is compared only if a `TraceSpec` is in force; a rate, units and
-        columns that it leaves out are not compared. A recipe that cannot be read, or that names
-        another reducer than the request's, is a SettingError, too.
+        parameters, nor `params` without the name of a reducer. A `trace` is compared only if a
+        `TraceSpec` is in force; a rate, units and columns that it leaves out are not compared. A
+        recipe that cannot be read, or that names another reducer than the request's, is a
+        SettingError, too.
         """
         given = {name: value for name, value in request.items() if value is not None}
         reducer = given.pop("reducer", None)
@@ -270,11 +274,13 @@ def _with_objects(
 ) -> Recipe:
     """Return a stored recipe, with the reducer object put into it if the recipe cannot name it.
 
-    `texts` are the store's settings, and `name` is the name of the store for messages. An object
-    equal to the reducer that the recipe names is accepted and not used; so is a name, which is not
-    compared here, and any reducer beside a model. Raises SettingError if an object is missing or
-    differs from the one that the store was made with, if a `model` is passed to an engine that
-    trains the recipe's own model, or if it lacks a method of `Model`. A store that holds no
+    `texts` are the store's settings, and `name` is the name of the store for messages. If the
+    recipe names its reducer, `reducer` is not used. It may then be a name, which is not compared
+    here, or an object that `to_toml` writes with the recipe's name and parameters; so no object
+    matches a short name like "conv". With a model any reducer is accepted. Raises SettingError if
+    an object is missing or differs from the one that the store was made with (a reducer in its
+    description, a model in its class alone), if a `model` is passed to an engine that trains the
+    recipe's own model, or if it is no baseline (`BaselineAdapter`). A store that holds no
     description of its object accepts any.
     """
     if "model" in texts and model is None:
@@ -325,11 +331,11 @@ def _check_description(texts: Mapping[str, str], name: str, description: str) ->
 def choose_recipe(reducer: Any, recipe: Any, given: Settings) -> Recipe:
     """Return the recipe that is asked for, with the settings of `given` in place of its own.
 
-    `recipe` is a Recipe, a name or a TOML file. If it is None, the default recipe of `reducer` is
-    taken, or that of conv. A setting of None keeps the recipe's own. Raises SettingError if
-    `recipe` names another reducer than `reducer`, for a `recipe` that is none, for a setting
-    out of range, and for a class that must be imported for a default and cannot be; TypeError for
-    an unknown setting.
+    `recipe` is what `Recipe.load` takes, such as a Recipe, a name or a TOML file. If it is None,
+    the recipe is loaded from `reducer`, or from "conv" if both are None. A setting of None keeps
+    the recipe's own. Raises SettingError if `recipe` names another reducer than `reducer`, if no
+    recipe can be read from the one that is loaded, for a setting out of range, and for a class that
+    must be imported for a default and cannot be; TypeError for an unknown setting.
     """
     source = recipe
     if source is None:
@@ -361,9 +367,10 @@ def named_classes(
 def check_imports(recipe: Recipe, store: str, allow_import: bool | Collection[str]) -> None:
     """Raise ImportRefusedError if a stored recipe names a class that may not be imported.
 
-    Whoever writes to the store could otherwise run code here. With `allow_import` True any class is
-    allowed, with False none; else it holds the names of the allowed classes. `store` is the store's
-    name in the message.
+    Whoever writes to the store could otherwise run code here. Only classes of the user are checked,
+    the reducer's and the decision rule's (`Recipe.user_classes`). With `allow_import` True any of
+    them is allowed, with False none; else it holds the names of the allowed ones, `module:Class`.
+    `store` is the store's name in the message.
     """
     if allow_import is True:
         return
@@ -403,10 +410,10 @@ def fill_from_peers(
 
     A peer is another cell of the store's product; the first peer that has settings is taken. Its
     seed is taken if `request` has none (0 without a peer), and its recipe if `request` names
-    neither reducer, recipe nor model. The recipe is not taken if the peer was given an object that
-    has no name. Nothing is imported. Raises ImportRefusedError if the recipe names a class that may
-    not be imported: any class may be with `allow_import` True, none with False, else those that it
-    names. Raises SettingError if the recipe, and ValueError if the seed cannot be read.
+    neither reducer, recipe nor model. The recipe is not taken if the peer was given an object, a
+    reducer or a model. Nothing is imported. Raises ImportRefusedError if the recipe names a class
+    that may not be imported (`check_imports`), SettingError if the recipe cannot be read,
+    ValueError if the seed cannot be read, and StoreError if the database fails.
     """
     peer = next(iter(store.settings.of_peers().values()), {})
     filled = dict(request)

@@ -71,9 +71,9 @@ class TrainingWindow:
     def add(self, trace: TraceArray, label: int, hash_: int, seq: int) -> None:
         """Add one labelled trace, shape (channels, samples); a full window loses its oldest one.
 
-        `label` is 1 or 0, `hash_` the content hash, and `seq` the label's number, which must be
-        larger than any before; this is not checked. All traces must have one shape. The trace is
-        copied.
+        `label` is 1 (good) or 0 (bad), `hash_` the `content_hash` of the trace's `StoredDecision`,
+        and `seq` the label's number, which must be larger than any before; this is not checked. All
+        traces must have one shape. The trace is copied.
         """
         if self._end == len(self._block[0]):
             self._enlarge(trace.shape)
@@ -173,7 +173,8 @@ class TrainedOn:
 
         Their names are "trained_on" (`seq`, the numbers of the labels), "trained_as"
         (`corrected_to`, the number of the newest correction), "counts_from" (labels with larger
-        numbers are new) and "pinned" (the version that a rollback put in force).
+        numbers are new) and "pinned" (the number of the earlier version that a rollback put in
+        force again, else 0).
         """
         return {
             "trained_on": self.seq,
@@ -294,12 +295,14 @@ class Retrainer:
     def train(self, current: EngineModel, begin: float) -> Trained:
         """Train a successor of the current model in this thread, and return the outcome.
 
-        A successor starts from the weights of the current model, or from scratch; it is trained on
-        the training window as it is now. `begin` is when work on the retrain began, in seconds by
-        the clock. The current model is not changed. If the training fails, the outcome has no
-        model, and nothing is raised; but what copying a user's model raises is raised. How long the
-        training took for its last step and the work after it is remembered: the longest of the
-        newest 20 is reserved in the time budget of the next. This thread then has one torch thread.
+        The model decides whether a successor starts from the weights of the current model or from
+        scratch. It is trained on the training window as it is now. `begin` is when work on the
+        retrain began, in seconds by the clock. It is only put in the outcome; the time budget
+        counts from the start of the training. The current model is not changed. If the training
+        fails, the outcome has no model, and nothing is raised; but what copying a user's model
+        raises is raised. How long the training took for its last step and the work after it is
+        remembered: the longest of the newest 20 is reserved in the time budget of the next. This
+        thread then has one torch thread.
         """
         data = self.window.snapshot()
         trained = train_candidate(
@@ -311,14 +314,15 @@ class Retrainer:
     def start(self, current: EngineModel) -> bool:
         """Begin to train a successor of the current model in the executor, on the present window.
 
-        A successor starts from the weights of the current model, or from scratch. `collect` returns
-        the outcome; no other training may be under way. The training waits in the executor until a
-        discarded one is done. Returns False, and begins nothing, if there is no executor, or if it
-        refuses work, or hangs with a discarded training (is not done with it after 60 s). An
-        executor that refuses work or hangs is started again if it can be, and otherwise one that
-        refuses work is given up, unless it still works on a discarded training. Logged are the
-        first training, the refusal, a restart that fails, and the giving up. What copying a user's
-        model raises is raised.
+        The model decides whether a successor starts from the weights of the current model or from
+        scratch. `collect` returns the outcome; no other training may be under way, which is not
+        checked. The training waits in the executor until a discarded one is done. Returns False,
+        and begins nothing, if there is no executor, or if it refuses work, or hangs with a
+        discarded training (is not done with it after 60 s). An executor that refuses work or hangs
+        is started again if it can be, and otherwise an executor that refuses work is given up,
+        unless it still works on a discarded training. Logged are the first training, if the
+        executor's process has imported its modules by then, the refusal, a restart that fails, and
+        the giving up. What copying a user's model raises is raised.
         """
         executor = self.executor
         if executor is None:
@@ -362,9 +366,10 @@ class Retrainer:
         """Return how many seconds the executor's training has left, before it counts as hung.
 
         It has HUNG seconds (60) from when the executor could begin with it: while the executor's
-        process still imports modules, and when a discarded training is done, the count starts anew.
-        The number is negative after that. A training that waits for a discarded one that hangs
-        counts as hung, too.
+        process still imports modules, and when a discarded training is done, the count starts anew
+        with this call, which sets `_began`, and `_discarded` to None. At 0 or below the training
+        counts as hung; if none was begun, the number means nothing. A training that waits for a
+        discarded one that hangs counts as hung, too.
         """
         now = time.monotonic()
         executor = self.executor
@@ -380,12 +385,12 @@ class Retrainer:
 
         Returns None if there is none or it is not done. With `wait` above 0 it blocks for at most
         `wait` seconds, and a training that is not done then is given up. So is, whatever `wait` is,
-        a training that hangs, or whose executor died. The outcome of a training that was given up
-        or failed has no model and says why. An executor that died or hangs is started again if it
-        can be. Otherwise retrains run without it: from then on if it died, else until it is free.
-        `begin` of the outcome is now minus the duration of the training. How long the training took
-        for its last step and the work after it is remembered: the longest of the newest 20 is
-        reserved in the budget of the next.
+        a training that hangs, or whose executor died; this is logged. The outcome of a training
+        that was given up or failed has no model and says why. An executor that died or hangs is
+        started again if it can be. Otherwise retrains run without it: from then on if it died, else
+        until it is free. `begin` of the outcome is now minus the duration of the training. How long
+        the training took for its last step and the work after it is remembered: the longest of the
+        newest 20 is reserved in the budget of the next.
         """
         future = self.future
         left = self._count_seconds_left()
@@ -404,7 +409,7 @@ class Retrainer:
 
         `error` is what the training, or waiting for it, raised; the reason begins with "dropped: ".
         If the training is not done and its executor lives, it is discarded. An executor that died,
-        or in which a training hangs, is started again if it can be, or not used.
+        or in which a training hangs, is started again or taken out of use (`_replace_executor`).
         """
         is_broken = isinstance(error, BrokenExecutor)
         training_raised = future.done() and not is_broken
@@ -448,16 +453,16 @@ def train_candidate(
     """Train a model on labelled traces and return the outcome.
 
     The outcome has the model, a reason in words, the number of steps, the durations of all and of
-    the last step with all after it, and the sequence numbers of the labels. `successor` is the
-    model, which this changes in place. No step begins after `step_seconds` seconds or `max_steps`
-    steps; None is no limit. Any exception, a window without traces, and a defect of the trained
-    model give an outcome without a model, whose reason begins with "dropped: ". A training that
-    reaches a limit ends early and is accepted; its reason says so if the time budget ended it
-    before its last step. The reason of each accepted training has the note (a line for the
-    operator) of the model's report, if there is one. `clock` returns seconds. The modules that a
-    training imports are loaded first; their time does not count, and a failure of this is logged.
-    Sets the present thread to one torch thread. It is a plain function, so that any executor can
-    run it.
+    the last step with all after it (0 without a step or without `step_seconds`), and the sequence
+    numbers of the labels. `successor` is the model, which this changes in place. No step begins
+    after `step_seconds` seconds or `max_steps` steps; None is no limit. Any exception, a window
+    without traces, and a defect of the trained model give an outcome without a model, whose reason
+    begins with "dropped: ". A training that reaches a limit ends early and is accepted; its reason
+    says so if `step_seconds` ended it and the model's report has `n_steps_left` above 0. The reason
+    of each accepted training has the note (a line for the operator) of that report, if there is
+    one. `clock` returns seconds. The modules that a training imports are loaded first; their time
+    does not count, and a failure of this is logged. Sets the present thread to one torch thread. It
+    is a plain function, so that any executor can run it.
     """
     torch.set_num_threads(1)  # it holds for the present thread only
     guarded(NOT_PRECOMPUTED, successor.warm_up)

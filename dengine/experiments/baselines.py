@@ -86,13 +86,13 @@ class Baseline(ABC):
         X : array, shape (n, C, T)
             Traces; (n, T) for one channel.
         y : array, shape (n,)
-            1 is success, any other value failure.
+            1 is success, any other value failure. It is not checked that there are n labels.
 
         Raises
         ------
         TraceError
-            If X has neither shape, or has values that are no real numbers. Traces of another length
-            than before are taken.
+            If X has neither shape, or has values that are no real numbers. NaN, infinities and
+            traces of another length than before are taken.
         """
         traces = as_traces(X)
         good = np.asarray(y) == 1
@@ -103,10 +103,11 @@ class Baseline(ABC):
     def add(self, x: ArrayLike, y: Any) -> Self:
         """Learn one trace `x` (C, T) with its label `y`, 1 for success, and return self.
 
-        Any other label is a failure. Nothing is learned or checked before a training has succeeded;
-        nothing is learned if the method learns only in `fit`. The prediction that is kept of the
-        last traces is dropped. Raises TraceError for values that are no trace. It is not checked
-        here that the trace is as long as those of the training.
+        Any other label is a failure. Nothing is learned or checked while `is_trained` is False;
+        nothing is learned if the method learns only in `fit`. The prediction that `predict` cached
+        is dropped. A trace (T,) has one channel. Raises TraceError for values that are no trace,
+        and ValueError for channels of different lengths. It is not checked here that the trace is
+        as long as those of the training.
         """
         self._last = None
         if self.is_trained:
@@ -136,8 +137,8 @@ class Baseline(ABC):
 
         It is ACCEPT if the lower bound of the success probability is at least the accept threshold,
         REJECT if the upper bound is at most the reject threshold, and otherwise VERIFY. If both
-        hold, it is ACCEPT. The attribute `thresholds` has both; if it is None, they are LB and 1 -
-        LB. Raises TraceError like `predict`.
+        hold, it is ACCEPT. The attribute `thresholds` has both thresholds; if it is None, they are
+        LB, which is `policy.lower_bound`, and 1 - LB. Raises TraceError like `predict`.
         """
         default = (self.policy.lower_bound, 1.0 - self.policy.lower_bound)
         accept_threshold, reject_threshold = self.thresholds or default
@@ -151,11 +152,12 @@ class Baseline(ABC):
         """Return bounds of the success probability, and counts of labels, for traces X (n, C, T).
 
         The last result is cached: the same object is returned again for the same traces until the
-        next `fit` or `add`, so do not change it. Before a training has succeeded, all bounds are 0
-        and 1. A baseline that counts no labels returns the integer 0, and no array, for both
-        counts; so does an untrained one. Traces (n, T) have one channel. Raises TraceError if X has
-        neither shape, or has values that are no real numbers. It is not checked here that the
-        traces are as long as those of the training.
+        next `fit` or `add`, so do not change it. While `is_trained` is False, all lower bounds are
+        0 and all upper bounds 1. A baseline that counts no labels returns the integer 0, and no
+        array, for both counts; so does an untrained one. Traces (n, T) have one channel. Raises
+        TraceError if X has neither shape, or has values that are no real numbers; NaN and
+        infinities pass. It is not checked here that the traces are as long as those of the
+        training.
         """
         traces = as_traces(X)
         key = traces.shape, traces.tobytes()
@@ -329,11 +331,10 @@ def make_baseline(name: str, policy: Policy, seed: int = 0, **params: Any) -> Ba
 
 
 def baseline_class(name: str) -> type[Baseline]:
-    """Return the class of a baseline by its name in `BASELINES`, or import it from `module:Class`,
-    which runs the module's code.
+    """Return the class of a baseline by its name in `BASELINES`, or import it from `module:Class`.
 
-    A name with a colon is always imported. Raises SettingError for an unknown name, a class that
-    cannot be imported, or one that is no subclass of `Baseline`.
+    A name with a colon is always imported, which runs the module's code. Raises SettingError for an
+    unknown name, a class that cannot be imported, or a class that is no subclass of `Baseline`.
     """
     kind = import_class(name) if ":" in name else BASELINES.get(name, object)
     if not issubclass(kind, Baseline):

@@ -193,8 +193,10 @@ class CostCurve:
         """What evidence would turn the verdict "may pay" into "pays", as a `Missing`.
 
         It gives one need in three units: how many different accepted parts in all (those seen
-        included), how many further recordings, or how many parts of production would show it. It
-        assumes that the shares of wrong decisions stay as they were seen. None if the verdict is
+        included), how many recordings beside the present ones, or how many parts of production
+        without any recordings would show it. In production only the audited share of the parts
+        counts: each part if the policy has stops "all"; 5 % (`AUDIT_RATE`) if it has no audits. It
+        is assumed that the shares of wrong decisions stay as they were seen. None if the verdict is
         another, or if 10,000 times the parts of a shuffle are too few.
         """
         row = self.marked
@@ -244,8 +246,10 @@ class CostCurve:
         """The verdict as sentences: the chosen policy, its cost with the interval, and, if it may
         pay, how many more parts would show that it pays, unless these are too many (`missing`).
 
-        They begin with "Nothing pays" if no policy pays or may pay. They also say if another policy
-        is cheaper, but not significantly, and if the search was interrupted.
+        If no policy pays or may pay, they begin with "Nothing pays" and give the cost of the
+        cheapest policy, or ask for more recordings if every part was verified. They also say if
+        another policy is cheaper than the chosen one, but not significantly, and if the search was
+        interrupted. They always say what verifying everything costs.
         """
         row = self.marked
         cheapest = self.rows[0]
@@ -302,8 +306,8 @@ class CostCurve:
         Its columns are the guarantee, alpha and lower_bound of the policy and the fields of
         `PolicyCost`: costs in the user's unit, and shares and error rates from 0 to 1. Of `bad` and
         `good` each field is a column, like `bad_rate`. `chosen` is True for the policy that pays or
-        may pay, if there is one. `reported` is False for the policies that were left behind,
-        because they were dearer in earlier shuffles.
+        may pay, if there is one. `reported` is False for the policies that were left behind.
+        Their costs come from earlier shuffles and are not comparable with those of other rows.
         """
         import pandas as pd
 
@@ -321,7 +325,8 @@ def policy_name(policy: Policy) -> str:
     """Return a policy's name for people, like "alpha 0.1, LB 95 %" or "pooled, LB 95 %".
 
     For a user's own rule it is "module:Class, LB 95 %". Under the guarantee "cost" it is only "the
-    cost guarantee".
+    cost guarantee". Only under "local" is alpha in it, so two policies with a rule of the user's
+    own that differ in alpha have the same name.
     """
     if policy.guarantee == "cost":
         return "the cost guarantee"
@@ -361,8 +366,8 @@ def candidates(
 
     LBs come the lowest first. If `lower_bounds` is empty, they are taken around break-even, at
     which 1 - LB is check / escape: 1 - LB is that ratio times 0.5, 1, 2, 4, 8 and 16 for "local"
-    (or the user's own rule), times 1, 2 and 4 for "pooled", each rounded to two digits. None is
-    below 80 %; if all would be below it, 80 % is the only one.
+    (or the user's own rule), times 1, 2 and 4 for "pooled", each product rounded to two
+    significant digits. LBs below 80 % are left out; if all are below it, 80 % is the only LB.
     """
     policy = contender.recipe.policy
 
@@ -398,9 +403,9 @@ def needed_parts(policy: Policy) -> int:
 
     For the guarantee "local" this is the number of good labels within the radius, without a bad
     one, that puts the lower end of the policy's interval at LB: z^2 LB / (1 - LB), rounded up, with
-    Wilson's interval; at most 10,000,000. For "pooled" it is the number of good parts, without a
-    bad one, whose score reaches the accept threshold, until there is enough evidence at error level
-    alpha. For other guarantees it is 0.
+    Wilson's interval; it is 10,000,000 if more are needed. For "pooled" it is the number of checked
+    parts, all good, that give enough evidence at error level alpha; their scores must reach a level
+    that may become the accept threshold. For other guarantees it is 0.
     """
     if policy.guarantee == "local":
         counts = range(1, MOST_NEIGHBOURS)
@@ -447,11 +452,13 @@ def cost_curve(
         What a check, a bad part that is accepted and a good part that is rejected cost, in one
         unit.
     recipe : object, default "conv"
-        Anything `Contender.load` takes. Guarantee (the rule by which a policy decides), alpha,
-        lower_bound and prices of its policy are replaced. If its policy has no audits (checks of
-        parts that the model is certain of) and stops="some", the guarantees "pooled" and "cost" get
-        an audit rate of 5 %, because they need outcomes of accepted parts. A rule of the user's own
-        keeps its guarantee, and a baseline plays "local" alone.
+        Anything `Contender.load` takes. The guarantee of its policy (the rule by which it decides)
+        is replaced, with alpha and lower_bound under "local", with lower_bound under "pooled", and
+        with the prices under "cost". Its other settings stay, also shadow mode, in which every part
+        is verified and no policy pays. But if its policy has no audits (checks of parts that the
+        model is certain of) and stops="some", the guarantees "pooled" and "cost" get an audit rate
+        of 5 %, because they need outcomes of accepted parts. A rule of the user's own keeps its
+        guarantee and gets alpha and lower_bound. A baseline plays "local" alone.
     alphas : sequence of float, default (0.1,)
         Values to try under the guarantee "local", or under a rule of the user's own.
     lower_bounds : sequence of float
@@ -481,7 +488,8 @@ def cost_curve(
         A price, or a number of repeats or cycles, out of range; a recipe that cannot be read; no
         policy that can be tried (those that are refused are left out); a check that is not
         cheaper than an escape; a false reject that costs nothing; recordings of one label, or too
-        few for any policy. With `keep` also for a reducer that cannot be hashed.
+        few for any policy; force limits that no recording can keep, or in seconds if the rate of
+        the recordings is unknown. With `keep` also for a reducer that cannot be hashed.
     DataError
         A data set that cannot be read.
     StoreError
@@ -525,11 +533,12 @@ def find_policy(
     Ctrl-C, nothing more is played. The result is then computed from the fresh shuffles (by which no
     policy was chosen) that every policy has finished, if there are two or more. Otherwise it is
     computed from the earlier ones, with its field `fresh` False; without two of these it is None.
-    The other parameters are those of `cost_curve`. Raises SettingError like that, and what `play`
-    raises.
+    The other parameters are those of `cost_curve`. Raises SettingError like `cost_curve`, and what
+    `play` raises.
     """
     _check_search(data, costs, repeats)
     n_cycles = len(data) if cycles is None else cycles
+    contender = contender.with_policy(shadow=False)
     changes = candidates(contender, costs, alphas, lower_bounds)
     policies, out_of_reach = _within_reach(contender, changes, n_cycles * float(data.y.mean()))
     expect(
@@ -638,7 +647,10 @@ def _within_reach(
 
 
 def _by_policy(replays: Iterable[Replay]) -> dict[Policy, list[Replay]]:
-    """Return the replays of each policy, in their order; policies in the order of their first."""
+    """Return the replays of each policy, in their order.
+
+    The policies come in the order in which their first replays come.
+    """
     groups: dict[Policy, list[Replay]] = {}
     for replay in replays:
         groups.setdefault(replay.recipe.policy, []).append(replay)
@@ -666,7 +678,8 @@ def _screen(
     dengine is replayed once for each seed, in shadow mode and with the force limits of the
     contender's recipe. The rule of each policy decides on its predictions (`replay_policy`); force
     limits of `policies` are not applied. A baseline has no such predictions: each policy has a
-    replay of its own. Policies vary fastest. `play` plays tasks and yields their replays.
+    replay of its own. Policies vary fastest. `play` plays tasks and returns their replays; if it
+    returns fewer, fewer are yielded.
     """
     if contender.baseline is not None:
         yield from play(_tasks(contender, policies, seeds, cycles))
@@ -687,10 +700,11 @@ def curve_of(
     """Return what a part costs under some policies at these prices, and which policy to choose.
 
     `groups` has each policy with its replays, all of the same shuffles in the same order. The
-    choice is repeated with each price halved and doubled; what changes then is in the field
-    `price_changes` of the result. Three arguments become fields of the result: `left_behind`, the
-    policies that were dearer in earlier shuffles; `out_of_reach`, policies that were not played,
-    each with the reason; and `fresh`, whether no policy was chosen by these shuffles.
+    choice, a policy's name or "check everything", is made again with each price halved and doubled;
+    choices that differ are in the field `price_changes` of the result. Three arguments become
+    fields of the result: `left_behind`, the policies that were dearer in earlier shuffles;
+    `out_of_reach`, policies that were not played, each with the reason; and `fresh`, whether no
+    policy was chosen by these shuffles.
     """
     rows, marked, verdict = _choose(groups, costs)
     chosen = _chosen_name(marked, verdict)
@@ -721,11 +735,13 @@ def curve_of(
 def _choose(groups: Groups, costs: Costs) -> tuple[list[PolicyCost], PolicyCost, str]:
     """Return a row for each policy in `groups`, the cheapest first, the best row, and the verdict.
 
-    `groups` has each policy with its replays. The best row is the cheapest (of equal ones that with
-    fewer bad accepted parts), unless some rows accept fewer bad parts, are not dearer at a
+    `groups` has each policy with its replays. The rows are sorted by mean cost; among equal costs
+    the row with fewer bad accepted parts comes first, then the row with the higher LB. The best row
+    is the first, unless some rows accept fewer bad parts, are not dearer than the first at a
     one-sided level of 5 %, and have an expected cost below the price of a check: then it is the row
-    of these with the fewest. The verdict is "pays" if the whole interval of its cost is below that
-    price, "does not pay" if its mean or expected cost is not, else "may pay".
+    of these with the fewest. The verdict is "does not pay" if the mean or the expected cost of the
+    best row is not below that price. Otherwise it is "pays" if the whole interval of its cost is
+    below that price, else "may pay".
     """
     rows = [_policy_cost(policy, replays, costs) for policy, replays in groups.items()]
     rows.sort(key=lambda row: (row.cost, row.escaped, -row.policy.lower_bound))
@@ -810,7 +826,8 @@ def _difference(
     The first value is a mean over all parts, in the unit of `costs`; it is negative if `first` is
     cheaper. The replays are those of two policies, which have played the same shuffles in the same
     order. The standard error adds the variance between parts, whose differences (less their mean)
-    are summed over the shuffles first, and the variance between shuffles, which is 0 for one.
+    are summed over the shuffles first, and the variance between shuffles, which is 0 for a single
+    shuffle.
     """
     differences = np.array(
         [

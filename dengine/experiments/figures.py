@@ -124,7 +124,7 @@ def save(figure: Figure, path: str | Path, dpi: int = 120, force: bool = False) 
     dpi : int, default 120
         Dots per inch.
     force : bool, default False
-        Whether a file that exists is replaced.
+        Whether a file that exists is replaced; a database or a link never is.
 
     Returns
     -------
@@ -134,7 +134,8 @@ def save(figure: Figure, path: str | Path, dpi: int = 120, force: bool = False) 
     Raises
     ------
     OutputError
-        The file exists and `force` is not set, it cannot be written, or the suffix names no format.
+        The file exists and `force` is not set, it cannot or must not be written, or the suffix
+        names no format.
     """
     path = Path(path)
     buffer = BytesIO()
@@ -151,9 +152,10 @@ def embedding_map(replay: Replay, title: str = "") -> Figure:
     that is missing), as it was at the decision; later retrains do not move it. Parts that no model
     embedded, or whose embedding has another number of dimensions than the replay's newest, are left
     out, on the left also parts of unknown truth. A circle with the recipe's radius is the
-    neighbourhood of the newest point. Without any point a text says so. If the first dimension is a
-    probability, the second says little: the vertical axis is then the cycle, and two vertical lines
-    bound the neighbourhood.
+    neighbourhood of the newest point. Without any point a text says so. If the recipe's reducer
+    gives an embedding that is never scaled (`has_own_unit`), its first dimension is taken for a
+    probability, and the second says little: the vertical axis is then the cycle, and two vertical
+    lines bound the neighbourhood. Raises SettingError if the reducer's class cannot be imported.
 
     Parameters
     ----------
@@ -246,8 +248,9 @@ def window_curves(replays: Sequence[Replay], window: int = WINDOW, fewest: int =
     Returns
     -------
     curves : DataFrame
-        A row for each cycle. Each column is a share in percent, over the window that ends with the
-        cycle. certain : the share of parts that the model accepted or rejected, the mean over the
+        A row for each cycle, indexed from 0. Each column is a share in percent, over the window
+        that ends with the cycle. A part of unknown truth counts as rightly decided.
+        certain : the share of parts that the model accepted or rejected, the mean over the
         replays. certain_low, certain_high : its 10th and 90th percentile over the replays.
         precision, false_positive : the shares of good and of bad parts among the accepted parts,
         counted in the windows of all replays together. false_negative : likewise, the share of
@@ -290,11 +293,12 @@ def curves(by_recipe: Mapping[str, Sequence[Replay]], title: str = "") -> Figure
     More keys have 20 others, which the 21st key and those after it use again.
 
     The panels show, from the top: the share of certain decisions, those without a check, and its
-    spread over the replays; the share of good parts among the accepted parts, and the policy's
-    lower bound LB; bad parts among the accepted parts (solid), good parts among the rejected parts
-    (dashed), and the tolerance 100 - LB, all in percent. The legend below has the counts of wrong
-    decisions. Shares of fewer than 20 parts are not drawn. The window is 300 cycles, or a third of
-    the longest replay if that is less.
+    spread over the replays; the share of good parts among the accepted parts, and the lower bound
+    LB of each policy; bad parts among the accepted parts (solid), good parts among the rejected
+    parts (dashed), and the tolerances 100 - LB, all in percent. The legend below has the counts of
+    wrong decisions. A part of unknown truth counts as rightly decided. Shares of fewer than 20
+    accepted or rejected parts are not drawn; the share of certain decisions is drawn from the first
+    cycle. The window is 300 cycles, or a third of the longest replay if that is less.
 
     Parameters
     ----------
@@ -358,12 +362,13 @@ def curves(by_recipe: Mapping[str, Sequence[Replay]], title: str = "") -> Figure
 def cost_picture(curve: CostCurve, unit: str = "s") -> Figure:
     """Draw what a part costs under each policy, with 95 % intervals.
 
-    On top are the policies that played the reported shuffles, the cheapest first. Below them,
-    hollow, are those that were left behind: their costs are of earlier shuffles, and cannot be
-    compared with the others. A line marks the cost of checking everything, and a ring the chosen
-    policy, if one pays or may pay. The axis begins at 0 and ends at 1.3 times the largest of these
-    costs and the price of a check; an interval that goes beyond its end ends in an arrow with its
-    value. The right panel shows the share of parts that were decided without a check.
+    On top are the policies that played the reported shuffles (random orders of the recordings), the
+    cheapest first. Below them, hollow, are those that the search left behind: their costs are of
+    earlier shuffles, and cannot be compared with the others. A line marks the cost of checking
+    everything, and a ring the chosen policy, unless its verdict (`CostCurve.verdict`) is "does not
+    pay". The axis begins at 0 and ends at 1.3 times the largest of these costs and the price of a
+    check; an interval that goes beyond its end ends in an arrow with its value. The right panel
+    shows the share of parts that were decided without a check.
 
     Parameters
     ----------
@@ -512,8 +517,8 @@ def data_picture(data: Dataset, title: str = "") -> Figure:
     Above, a panel for each of the first three channels shows the median trace of good and of bad
     parts, and where the middle 80 % lie. Below are the share of good parts in a sliding tenth of
     the set, and among all, and the mean of each trace's first channel, in the order of the set.
-    Traces with a sample that is not finite are not drawn; their labels count in the share. `title`
-    begins the title.
+    Traces with a sample that is not finite are not drawn; their labels count in the share. The
+    title is `title`, a colon and what is drawn. Raises what `data.spec` raises.
     """
     X = data.cube
     finite: NDArray[np.bool_] = np.asarray(np.isfinite(X).all(axis=(1, 2)))
@@ -541,8 +546,7 @@ def _draw_drift(figure: Any, data: Dataset, finite: NDArray[np.bool_], label: st
     The share begins at the end of the first tenth; a dotted line is the share in the whole set. A
     tenth is at least one part. The mean is taken over the samples of the first channel, and its dot
     has the colour of the part's label; `label` names this channel and its unit. `figure` is a
-    Figure or SubFigure, and `finite` (n,) says which of the n traces have no sample that is not
-    finite.
+    Figure or SubFigure, and `finite` (n,) says which of the n traces have only finite samples.
     """
     import pandas as pd
 

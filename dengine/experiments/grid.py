@@ -95,16 +95,17 @@ class KeptReplays:
     def path(self, task: Task) -> Path:
         """Return the path of the file of a task's replay in the folder, whether or not it exists.
 
-        The name of the file is a hash of what the decisions depend on: data, settings, seed,
-        libraries, and the source code of dengine and of the reducer's classes and functions. The
-        code of a decision rule or baseline of the user's own (`module:Class`), or of a base class
-        in another file, is not in it. A reducer that is a `module:Class` is imported.
+        The name of the file is a hash of what the decisions depend on: data, settings, seed, the
+        versions of Python and of `LIBRARIES`, the source code of dengine, and the files that define
+        the reducer's classes and functions. Other files of the user's are not in it, for example
+        one with a base class, a decision rule or a baseline. A reducer that is a `module:Class` is
+        imported.
 
         Raises
         ------
         SettingError
-            The reducer holds an object that cannot be hashed, such as a lambda, or is a
-            module:Class that cannot be imported.
+            The reducer holds an object that cannot be hashed, such as a lambda, or its class
+            cannot be imported or is no scikit-learn transformer.
         """
         from joblib import hash as digest
 
@@ -299,8 +300,8 @@ def iterate_replays(
         A baseline that cannot be found or imported: this is raised after the kept replays were
         yielded, and before anything is played. A replay that cannot be played, see `replay`. With
         `keep` also for a reducer that cannot be hashed or imported, before any replay is yielded.
-    DataError
-        A data set that cannot be read.
+    DataError, ValueError
+        A data set that cannot be read, see `load_dataset`.
     StoreError
         A store, given as the data set, that cannot be opened or read.
     OutputError
@@ -433,8 +434,9 @@ def grid_tasks(
     Raises
     ------
     SettingError
-        A recipe cannot be loaded, two have the same name and policy, or a setting is out of range.
-        Names and policies are compared as loaded, before `alphas` and the others replace settings.
+        A recipe cannot be loaded, the class of its reducer cannot be imported, two have the same
+        name and policy, or a setting is out of range. Names and policies are compared as loaded,
+        before `alphas` and the others replace settings.
     """
     seeds = list(seeds)
     names = ("interval", "alpha", "lower_bound")

@@ -62,8 +62,8 @@ def pooled_error(replays: Sequence[Any], side: str = "accepted", alpha: float = 
     Parameters
     ----------
     replays : sequence of Replay
-        All of one data set; may be empty. None of a live run, which does not record which traces it
-        had.
+        All of one data set; may be empty. No replay may be of a live run, which does not record
+        which traces it had.
     side : {"accepted", "rejected"}, default "accepted"
         Which decisions are judged.
     alpha : float, default 0.05
@@ -78,6 +78,8 @@ def pooled_error(replays: Sequence[Any], side: str = "accepted", alpha: float = 
     ------
     SettingError
         An unknown side; with decisions of that side also an alpha that is not between 0 and 1.
+    IndexError
+        A replay of a live run with one cycle or more.
 
     References
     ----------

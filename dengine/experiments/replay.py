@@ -106,9 +106,10 @@ class Contender:
         ----------
         recipe : Contender, str or object
             A contender is returned as it is. A baseline's name gives the baseline with its default
-            settings, and with the default `retrain_every` of reducers, not that of conv. Otherwise
-            anything that `Recipe.load` takes; the name of a contender that is read from a TOML file
-            is the file's name without suffix.
+            settings, in a default `Recipe` whose `retrain_every` is that of the class `Reducer`.
+            Otherwise anything that `Recipe.load` takes. A contender from a TOML file has the name
+            of the file without its suffix, and one from a name in `RECIPES` has this name; any
+            other has `Recipe.name`, so `Recipe` objects with one reducer have one name.
 
         Raises
         ------
@@ -317,9 +318,9 @@ class Replay:
         counts : dict
             first_cycle and last_cycle, counted from 1. verified_share, NaN without cycles. Numbers
             of cycles: verified, accepted, rejected (by the model), false_positive (accepted and
-            bad), false_negative (rejected and good), novel (verified as novel), safe_mode (after
-            which every part is verified), outside (the trace left the force limits), and stops, the
-            line stops.
+            known to be bad), false_negative (rejected and known to be good), novel (verified as
+            novel), safe_mode (after which every part is verified), outside (the trace left the
+            force limits), and stops, the line stops.
         """
         begin, end, _ = cycles.indices(len(self))
         counts = {name: int(getattr(self, name)[cycles].sum()) for name in COUNTED}
@@ -334,7 +335,8 @@ class Replay:
     def summary(self, check_seconds: float = VERIFY_SECONDS) -> dict[str, Any]:
         """Return one row of a table: settings, counts, shares and times over the whole run.
 
-        Shares, times and `first_certain` are NaN if there is nothing to compute them from.
+        Shares, quantiles and `first_certain` are NaN if there is nothing to compute them from, and
+        `seconds` is NaN in a live run. A decision on a part of unknown truth counts as right.
 
         Parameters
         ----------
@@ -509,7 +511,8 @@ def replay(
 ) -> Replay:
     """Play a data set through a fresh engine in memory, in one pass; return what was decided.
 
-    It limits this thread to one torch thread, for an engine of yours only if that trains in it.
+    It limits this thread to one torch thread; if `recipe` is an engine, only if the engine's
+    trainings run in this thread.
 
     Parameters
     ----------
@@ -541,14 +544,15 @@ def replay(
     Raises
     ------
     SettingError
-        A number of cycles that the data set does not have, anything that is no recipe, a baseline
-        that cannot be made, alpha or lower_bound out of range or beside an engine, a malformed
-        `windows.trigger` of the data's description, or a policy with force limits in seconds for a
-        data set of an unknown rate.
-    DataError
-        A data set that cannot be read.
+        A number of cycles that the data set does not have, anything that is no recipe, a reducer,
+        rule or baseline that cannot be made, alpha or lower_bound out of range or beside an engine,
+        a malformed `windows.trigger` of the data's description, or a policy with force limits in
+        seconds for a data set of an unknown rate.
+    DataError, ValueError
+        A data set that cannot be read, see `load_dataset`.
     StoreError
-        A store, given as the data set, that cannot be opened or read.
+        A store, given as the data set, that cannot be opened or read. For an engine of yours also
+        if `DataEngine.run` raises it, for example because the engine is closed.
     TraceError
         For an engine of yours, traces that it does not take.
     """
@@ -590,21 +594,22 @@ def replay_policy(scores: Replay, policy: Policy) -> Replay:
     """Let a policy decide on the predictions that a replay in shadow mode recorded.
 
     No model is asked. In shadow mode every part was verified, and the counts and embeddings of the
-    model were recorded. The rule of the policy decides on these; a rule that only sorts takes the
-    first axis of the embedding, if the reducer predicts a probability there, and no counts. This
-    probability is drawn towards 1/2 while few parts have come (`fade`), if the rule has
-    `prior_labels`. A rule learns only outcomes that it would know in a replay of its own: checks,
-    audits and line stops, and with `stops="all"` also that an accepted part was good. Two
-    differences to such a replay stay: the predictions come from a model that has learned all
-    labels, and the force limits are those of `scores`; those of `policy` are not applied, since a
-    replay has no traces. Audits are drawn anew, by the seed of the replay. A part for which the
-    model was not asked, such as a novel one or one that left an operator's force limits, is
-    verified; the rule learns its outcome, too, with the bounds 0 and 1.
+    model were recorded. The rule of the policy decides on these. A rule whose bound only sorts
+    parts (`DecisionRule.sorts`), like those of "pooled" and "cost", takes the first axis of the
+    embedding, if the reducer predicts a probability there, and no counts. This probability is drawn
+    towards 1/2 while few parts have come (`fade`), if the rule has `prior_labels`. A rule learns
+    only outcomes that it would know in a replay of its own: checks, audits and line stops, and with
+    `stops="all"` also that an accepted part was good. Two differences to such a replay stay: the
+    predictions come from a model that has learned all labels, and the force limits are those of
+    `scores`; those of `policy` are not applied, since a replay has no traces. Audits are drawn
+    anew, by the seed of the replay. A part for which the model was not asked, such as a novel part
+    or one that left an operator's force limits, is verified; the rule learns its outcome, too, with
+    the bounds 0 and 1.
 
     Parameters
     ----------
     scores : Replay
-        A replay with `Policy(shadow=True)`.
+        A replay with `Policy(shadow=True)`; this is not checked.
     policy : Policy
 
     Returns

@@ -87,8 +87,10 @@ class Survey:
 def survey_dataset(data: Dataset) -> Survey:
     """Count the traces, labels, faults and repeats of a data set.
 
-    Near repeats are looked for among the newest 500 usable traces: finite, not constant, and
-    without a sample beyond 1e18. Nothing is trained, and the data set is not changed.
+    Repeats are counted among the usable traces, which are finite, not constant, and without a
+    sample beyond 1e18: those that equal an earlier one, and, of the newest 500, those that nearly
+    repeat the trace of another part (`near_repeats`). Nothing is trained, and the data set is not
+    changed.
 
     Parameters
     ----------

@@ -76,7 +76,7 @@ def pool(frame: pd.DataFrame, replays: Sequence[Replay]) -> list[Row]:
     Parameters
     ----------
     frame : DataFrame
-        As `frame_of` gives it.
+        As `frame_of` gives it for one replay or more.
     replays : sequence of Replay
         The replays of the frame's rows, in their order, all of one data set and none of a live run.
 
@@ -95,8 +95,8 @@ def pool(frame: pd.DataFrame, replays: Sequence[Replay]) -> list[Row]:
           mean, as `AGGREGATED` says. Replays without such a value (NaN) are left out.
         - error_lower, error_upper : 95 % interval of the share of bad parts among the accepted
           parts; 0 and 1 if none was accepted.
-        - promise_kept : whether the pooled precision is at least LB; None if fewer than 200 parts
-          were accepted.
+        - promise_kept : whether the pooled precision is at least `lower_bound`; None if fewer than
+          200 parts were accepted.
         - retrains_dropped : number of retrains whose version was not put in force.
     """
     rows = []
@@ -132,8 +132,8 @@ def promise_lines(rows: Sequence[Row]) -> list[str]:
     A row has replays with the same settings, counted together. LB is the lower bound of its policy.
     The sentence ends with "kept" or "broken", or says that no part, or too few parts, were
     accepted. It always names the recipe and the guarantee. It names the interval and alpha only if
-    the rows differ in it. It has the share of good parts, and the interval of the share of bad
-    parts.
+    the rows differ in it. Unless no part was accepted, it has the share of good parts among the
+    accepted parts, the interval of the share of bad parts, and LB.
     """
     varying = [name for name in ("interval", "alpha") if len({row[name] for row in rows}) > 1]
     lines = []
@@ -188,11 +188,12 @@ def table_of_numbers(
         Draw a line above the last row.
     """
     from rich.box import SIMPLE_HEAD
+    from rich.markup import escape
     from rich.table import Table
 
     table = Table(
-        title=f"\n{title}\n",
-        caption=f"\n{caption}\n",
+        title=f"\n{escape(title)}\n",
+        caption=f"\n{escape(caption)}\n",
         box=SIMPLE_HEAD,
         title_justify="left",
         caption_justify="left",

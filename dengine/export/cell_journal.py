@@ -17,7 +17,7 @@ example because its traces have another shape, DataError is raised and names the
 """
 
 import zlib
-from contextlib import ExitStack
+from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -247,7 +247,7 @@ def import_journal(store: "StoreLike", path: FilePath, any_model: bool = False) 
 
     Parameters
     ----------
-    store : str, path-like or Store
+    store : str, path-like or SqlStore
         The store that the model was exported from.
     path : path-like
         The journal.
@@ -273,10 +273,8 @@ def import_journal(store: "StoreLike", path: FilePath, any_model: bool = False) 
     OSError
         If the journal cannot be read.
     """
-    with opening(store, must_exist=True) as opened, ExitStack() as claim:
-        # An engine that runs would never learn these labels.
-        if (owned := opened.claim_cell()) is not None:
-            claim.callback(owned.close)
+    # The cell is claimed, since an engine that runs would never learn these labels.
+    with opening(store, must_exist=True) as opened, closing(opened.claim_cell()):
         settings = opened.settings.read()
         spec = stored_trace_spec(settings)
         if spec is None or "recipe" not in settings:

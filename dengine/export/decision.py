@@ -105,7 +105,8 @@ class DecisionModule(nn.Module):
 
         Before that, an accept that is still pending is settled (`settle`): it is learned as good,
         or counts as unreported. Any other pending decision is discarded. After a faulty trace no
-        decision is pending. If the decider raises, the accept is settled already.
+        decision is pending. Afterwards `predicted` returns what the model alone would have done. If
+        the decider raises, the accept is settled already.
 
         Parameters
         ----------
@@ -119,9 +120,10 @@ class DecisionModule(nn.Module):
         action, reason : int
             Positions in `Action` and `Reason`.
         lower, upper : float
-            Bound on the success probability; (0, 1) for a faulty trace or if a force limit decides.
+            Bound on the success probability; (0, 1) for a faulty or a novel trace, or if a force
+            limit decides.
         n_success, n_failure : int
-            Labels within the radius; 0 for a faulty trace, or if a force limit decides.
+            Labels within the radius; 0 for a faulty or a novel trace, or if a force limit decides.
         embedding : Tensor of float32, shape (K, d)
             NaN for a faulty trace, which is verified.
 

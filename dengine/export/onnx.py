@@ -69,8 +69,9 @@ def export_onnx(
     """Write the decision of an engine, or of a fitted model, as ONNX, with its checksum beside it.
 
     The file is written only if onnxruntime decides on random traces as the model does. An engine's
-    store records the export as an event. While torch makes the program, Python's warnings, and log
-    messages up to level WARNING, are off in the whole process.
+    store records the export as an event, before the file is written. A damaged trace among those
+    whose embeddings are compared is left out, and an event is written, too. While torch makes the
+    program, Python's warnings, and log messages up to level WARNING, are off in the whole process.
 
     Parameters
     ----------
@@ -84,7 +85,8 @@ def export_onnx(
     key : path-like, optional
         File of a key (`make_key`); the signature is written beside the file, as PATH.sig.
     force : bool, default False
-        Whether to replace an existing file; never a database, a folder or a link.
+        Whether to replace an existing file; never a database, a folder or a link. Without a key,
+        the signature of a replaced file is removed.
 
     Returns
     -------
@@ -94,15 +96,15 @@ def export_onnx(
     Raises
     ------
     ExportError
-        If the engine audits (checks some parts that the model is certain of), has force limits or a
-        decision rule other than that of the guarantee "local" with stops "some", or if a part is
-        among the references more than once; the message names all of these that apply. Also if
-        nothing was trained yet; for a baseline; if `trace` has another shape than the model's
-        traces; if the reducer, the interval or the rule cannot be exported; if the compiled
-        decision and the reducer map a trace to different points; if the rule is stale, because an
-        update of it failed; if the store was changed from outside; if the key cannot be read; if a
-        package is missing; and if onnxruntime does not decide like the model. Other errors of torch
-        and onnxruntime are raised as they are.
+        If the engine audits (checks some parts that the model is certain of) or is in shadow mode,
+        has force limits or a decision rule other than that of the guarantee "local" with stops
+        "some", or if a part is among the references more than once; the message names all of these
+        that apply. Also if nothing was trained yet; for a baseline; if `trace` has another shape
+        than the model's traces; if the reducer, the interval or the rule cannot be exported; if the
+        compiled decision and the reducer give a trace different embeddings; if the rule is stale,
+        because an update of it failed; if the store was changed from outside; if the key cannot be
+        read or has fewer than 16 bytes; if a package is missing; and if onnxruntime does not decide
+        like the model. Other errors of torch and onnxruntime are raised as they are.
     SettingError
         If the engine's force limits do not fit `trace`.
     OutputError
@@ -134,8 +136,8 @@ def load_onnx(path: FilePath, *, key: FilePath | None = None) -> "OnnxModel":
     ----------
     path : path-like
     key : path-like, optional
-        File of the key that it was signed with, which is checked first. None: no signature is asked
-        for.
+        File of the key that it was signed with; the signature is checked after the checksum and
+        before the program is parsed. None: no signature is asked for.
 
     Returns
     -------
@@ -144,9 +146,10 @@ def load_onnx(path: FilePath, *, key: FilePath | None = None) -> "OnnxModel":
     Raises
     ------
     ExportError
-        For a file that is missing, damaged or not signed with the key, a key that cannot be read
-        or has fewer than 16 bytes, a file that is no ONNX export, has another schema or is refused
-        by onnxruntime, and if a package for ONNX is missing.
+        For a file that is missing, has no checksum beside it (PATH.sha256), is damaged or not
+        signed with the key, a key that cannot be read or has fewer than 16 bytes, a file that is no
+        ONNX export, has another schema or is refused by onnxruntime, and if a package for ONNX is
+        missing.
     """
     _require_packages()
     import onnx
@@ -165,9 +168,9 @@ def load_onnx(path: FilePath, *, key: FilePath | None = None) -> "OnnxModel":
 def _refuse_unsupported(source: Exportable) -> None:
     """Raise ExportError if the decision needs something that ONNX cannot carry, and name it all.
 
-    That is an audit rate above 0, a decision rule other than that of the guarantee "local" with
-    stops "some" (also a user's own rule), a part that is among the references more than once, and
-    force limits. Otherwise nothing happens.
+    ONNX cannot carry an audit rate above 0 (the rate is 1 in shadow mode), a decision rule other
+    than that of the guarantee "local" with stops "some" (also a user's own rule), a part that is
+    among the references more than once, and force limits.
     """
     rule = type(source.model.rule)  # a user's own as well: `OnnxDecision` knows the paper's alone
     n_repeats = int(source.model.index.repeats)
@@ -220,9 +223,9 @@ class OnnxModel:
 
         Returns action, reason, lower, upper, n_success, n_failure and embedding (K, d). Another T
         is cut, padded or resampled, or refused, as `TraceSpec.fit` says. A faulty trace, or a novel
-        one, which is unlike all traces of the training, is verified, with the bound (0, 1) and no
+        trace, which is unlike all traces of the training, is verified, with the bound (0, 1) and no
         labels, and its reason says so; the embedding of a faulty trace is NaN. Raises TraceError
-        for a wrong shape, and for values that are no real numbers.
+        for a wrong shape, a T that is refused, and values that are no real numbers.
         """
         outputs = self.session.run(None, {"trace": as_trace(trace, self.trace)})
         action, reason, *counted, z = outputs
@@ -307,9 +310,9 @@ class OnnxDecision(nn.Module):
         """Count the labels within the radius; return action, lower, upper, n_success, n_failure.
 
         `distances` are the squared distances to the references, (n,). The results are tensors
-        without a dimension. The action follows from the bound (`lower`, `upper`) by the paper's
-        rule: 1 accept if lower reaches the rule's accept threshold, else 2 reject if upper is at
-        most its reject threshold, else 0 verify. A reference at the radius counts.
+        without a dimension. The action follows from the bound (`lower`, `upper`) by the
+        `DecisionRule`: 1 accept if lower reaches the rule's accept threshold, else 2 reject if
+        upper is at most its reject threshold, else 0 verify. A reference at the radius counts.
         """
         is_inside = distances <= self.radius * self.radius
         n_success = (is_inside & (self.labels == 1)).sum()
@@ -349,11 +352,12 @@ def _check_decisions(onnx_model: OnnxModel, model: Any, spec: TraceSpec) -> None
     """Compare an ONNX model with the model that it was made from, on 64 traces of noise.
 
     The noise has amplitudes from 0.01 to 100, and is clipped at 0.9 times the sensor's limit in
-    `spec`, if there is one. Raises ExportError if a coordinate of an embedding differs by more than
-    0.0001 times (1 + its absolute value), if the counts of good and bad labels together differ by
-    more than two, or if counts are equal but the action differs, or the differences of the two ends
-    of the bound add up to more than 1e-6. The noise is always the same. Counts may differ, since a
-    reference may lie exactly at the radius.
+    `spec`, if there is one; it is always the same. Raises ExportError if a coordinate of an
+    embedding differs by more than 0.0001 times (1 + the absolute value of the model's coordinate),
+    or if the counts of good and bad labels together differ by more than two. If the counts are
+    equal, it is also raised if the action differs, or if the differences of the two ends of the
+    bound add up to more than 1e-6. Counts may differ, since a reference may lie exactly at the
+    radius; action and bound are then not compared. The reason is never compared.
     """
     rng = np.random.default_rng(0)
     shape = (N_CHECKED, spec.channels, spec.samples)

@@ -123,11 +123,12 @@ def export_torchscript(
     Raises
     ------
     ExportError
-        If nothing was trained yet, for a baseline, if `trace` has another shape than the model's
-        traces, if the reducer, the interval or the decision rule cannot be compiled, if the
-        compiled decision and the reducer map one of up to eight labelled traces to different
-        points, if the rule is stale, because an update of it failed, if the store was changed from
-        outside, and if the key cannot be read or has fewer than 16 bytes.
+        If nothing was trained yet, for a baseline (a model that was handed in to the engine), if
+        `trace` has another shape than the model's traces, if the reducer, the interval or the
+        decision rule cannot be compiled, if the compiled decision and the reducer map one of up to
+        eight labelled traces to different points, if the rule is stale, because an update of it
+        failed, if the store was changed from outside, and if the key cannot be read or has fewer
+        than 16 bytes.
     SettingError
         If the engine's force limits do not fit `trace`.
     OutputError
@@ -213,8 +214,8 @@ class ExportedModel:
 
         If the part before it was accepted and nothing was reported about it, that part is settled
         first. If the description says `stops` "all", it is learned as good and becomes a reference.
-        If it says "some", the part is counted as unreported. After a faulty trace no decision is
-        pending.
+        If it says "some", the part is counted as unreported. A VERIFY or REJECT that is still
+        pending is discarded. After a faulty trace no decision is pending.
 
         Parameters
         ----------
@@ -231,8 +232,8 @@ class ExportedModel:
         Raises
         ------
         TraceError
-            For a wrong shape, or a part that is neither a whole number nor a text of 1 to 200
-            printable characters.
+            For a wrong shape, values that are no real numbers, or a part that is neither a whole
+            number nor a text of 1 to 200 printable characters.
         """
         x = torch.from_numpy(as_trace(trace, self.trace))
         with torch.inference_mode():
@@ -268,8 +269,8 @@ class ExportedModel:
         Raises
         ------
         TraceError
-            For a wrong shape, or a part that is neither a whole number nor a text of 1 to 200
-            printable characters.
+            For a wrong shape, values that are no real numbers, or a part that is neither a whole
+            number nor a text of 1 to 200 printable characters.
         ReportError
             For a label that is not True, False, 1 or 0.
         """
@@ -318,8 +319,8 @@ def _part_hash(part: Any) -> int:
 def load_exported(path: FilePath, *, key: FilePath | None = None) -> ExportedModel:
     """Check an exported file, load it and warm it up.
 
-    Once checksum, signature and description are checked, torch uses one thread in this process for
-    good, also if the loading fails: it is steadier by far at these sizes.
+    Once checksum, signature and description are checked, the calling thread is limited to one torch
+    thread for good, also if the loading fails: it is steadier by far at these sizes.
 
     Parameters
     ----------
@@ -336,11 +337,11 @@ def load_exported(path: FilePath, *, key: FilePath | None = None) -> ExportedMod
     ------
     ExportError
         Before anything is loaded: for a file that is missing, damaged, truncated, no export or of
-        another schema, or that was not signed with the key, and for a key that cannot be read.
-        Afterwards: if it is no TorchScript, if its description does not fit its module, or if this
-        machine does not compute the embedding that the file holds for a test trace, up to 0.0001
-        times (1 + the absolute value) of each coordinate. Errors inside the module, torch.jit.Error
-        or RuntimeError, are raised as they are.
+        another schema, or that was not signed with the key, and for a key that cannot be read or
+        has fewer than 16 bytes. Afterwards: if it is no TorchScript, if its description does not
+        fit its module, or if this machine does not compute the embedding that the file holds for a
+        test trace, up to 0.0001 times (1 + the absolute value) of each coordinate. Errors inside
+        the module, torch.jit.Error or RuntimeError, are raised as they are.
     """
     target = Path(path)
     content = read_checked(target, key)
@@ -368,9 +369,9 @@ def _check_golden(model: ExportedModel, path: Path) -> None:
     """Warm a model up on the test trace in its file; raise ExportError for another embedding.
 
     The test trace and its expected embedding are the entry "golden" of the description. A
-    coordinate may differ by 0.0001 times (1 + its absolute value). The model decides on the trace
-    three times, learns it as good, and as bad, and its `metadata` changes, so pass a copy. `path`
-    is named in the error.
+    coordinate may differ by 0.0001 times (1 + its absolute value). Three times the model decides on
+    the trace, learns it as good and learns it as bad. This changes the model and its `metadata`, so
+    pass a copy. `path` is named in the error.
     """
     golden = model.metadata["golden"]
     trace = np.array(golden["trace"], dtype=np.float32)

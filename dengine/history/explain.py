@@ -266,8 +266,9 @@ def _find_neighbours(
     equal to its trace) are left out. Nothing is yielded if `version` is None, or if the trace of
     the decision was not embedded. A neighbour may lie outside of the radius, which only says what
     its field `inside` is. If the decision behind a reference is unknown (another cell made it, or
-    its label is damaged), its id, part, source and trace are None. Label and source are those that
-    the version had, without later corrections. Raises StoreError for a damaged trace.
+    its label is damaged), its id, part, source and trace are None. `success` is the label that
+    the version had, without later corrections; `source` is the first report's, without any
+    correction. Raises StoreError for a damaged trace.
     """
     embedding = item.decision.embedding  # (K, d)
     if version is None or embedding is None:

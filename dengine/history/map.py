@@ -75,14 +75,14 @@ class PartMap:
 def part_map(store: "SqlStore", recipe: Recipe, version: int) -> PartMap:
     """Read the map of the parts, the points of the web page's picture, for a model version.
 
-    Known parts are references of the version, newest parts are decisions. A damaged label is left
-    out, and an event is written to the store.
+    Known parts are references of the version, the labelled traces with which it compares a new one;
+    newest parts are decisions. A damaged label is left out, and an event is written to the store.
 
     Parameters
     ----------
     store : SqlStore
     recipe : Recipe
-        With the radius and the reducer.
+        With the radius and the reducer, whose class is imported if it is a `module:Class`.
     version : int
         The model version. 0 stands for the time before the first version: the map is empty.
 
@@ -92,7 +92,7 @@ def part_map(store: "SqlStore", recipe: Recipe, version: int) -> PartMap:
         The known parts are the newest 250 references whose label this cell recorded. Their labels
         are as the version had them, or as they were reported later; a later correction does not
         show. There are none if no such version was put in force, if its state is damaged or no
-        longer kept, or if it has no references (a baseline or a handed-in model). The newest parts
+        longer kept, or if it has no references (a model that the user handed in). The newest parts
         come from the cell's newest 10 decisions, of any version: those that this version made and
         whose trace it embedded, with corrected labels. A part that is both appears once, as a
         newest part.
@@ -100,7 +100,8 @@ def part_map(store: "SqlStore", recipe: Recipe, version: int) -> PartMap:
     Raises
     ------
     SettingError
-        For an unknown reducer, and if an object of the user's class of rule cannot be made.
+        For an unknown reducer, and if an object of the user's class of rule cannot be made. An
+        error of the rule's constructor other than TypeError is raised as it is.
     StoreError
         If the store cannot be read.
     """

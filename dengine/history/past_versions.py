@@ -16,11 +16,11 @@ from ..decision.policy import RULES, Policy
 from ..decision.references import RadiusIndex
 from ..decision.rule import DecisionRule
 from ..decision.scripting import arrays_with_prefix, restore
-from ..errors import StoreError
+from ..errors import StoreError, VersionError
 from ..folds import fold_of
 from ..recipe import Recipe
 from ..records import Reason, Source
-from ..store.records import ModelVersion, OutcomeRecord, StoredDecision, VersionError
+from ..store.records import ModelVersion, OutcomeRecord, StoredDecision
 from ..store.rule_progress import read_rule_progress
 from ..store.views import PastLabel
 
@@ -65,9 +65,9 @@ def load_past_version(
 
     Its references and its rule include this cell's labels that had come by then, as they were
     reported: later corrections are not applied. Of the labels that came after the version was
-    trained, only those until the next version of this cell, and at most MAX_LABELS (100,000), are
-    read; they become references if this version was in force when they came. A damaged label is
-    left out, and an event is written to the store.
+    trained, only those that came before the next version of this cell was stored, and at most
+    MAX_LABELS (100,000), are read; they become references if this version was in force when they
+    came. A damaged label is left out, and an event is written to the store.
 
     Parameters
     ----------
@@ -77,22 +77,24 @@ def load_past_version(
     recipe : Recipe
         The recipe of that moment.
     item : StoredDecision or None
-        The decision, with its trace. None: the version with all labels that came until the next
-        version of this cell was put in force.
+        The decision, with its trace. None: the version with all labels that came before the next
+        version of this cell was stored.
 
     Returns
     -------
     PastVersion or None
-        The references with their labels, the thresholds of the rule, and how novel the trace of the
-        decision was. None if no such version was put in force, if its state is damaged or no longer
-        kept, or if it has no references (a baseline, a model that the user handed in).
+        The references with their labels (None for a label of another cell or a damaged one), the
+        thresholds of the rule, and how novel the trace of the decision was. None if no such version
+        was put in force, if its state is damaged or no longer kept, or if it has no references (a
+        baseline, a model that the user handed in).
 
     Raises
     ------
     StoreError
         If the store cannot be read.
     SettingError
-        If an object of the user's class of rule cannot be made.
+        If an object of the user's class of rule cannot be made. An error of its constructor other
+        than TypeError, and what its `observe` and `update` raise, is raised as it is.
     """
     try:
         stored = store.versions.load(version)
@@ -156,9 +158,10 @@ def _score_novelty(stored: ModelVersion, item: StoredDecision | None) -> Novelty
     """Compute how novel the trace of a decision was, by its version's `NoveltyGate`.
 
     The gate calls a trace novel by its distance from the traces of the training. The result has
-    four numbers (level, texture, distortion, gaps), of which at least one is above 1 for a novel
-    trace. Returns None without a decision, if the decision's reason is not `Reason.NOVEL`, and if
-    the gate cannot be restored, because it was switched off or is of another release of dengine.
+    four numbers (level, texture, distortion, gaps), of which for a novel trace at least one is
+    above 1, or NaN because a feature overflowed. Returns None without a decision, if the decision's
+    reason is not `Reason.NOVEL`, and if the gate cannot be restored, because it was switched off or
+    is of another release of dengine.
     """
     if item is None or item.decision.reason is not Reason.NOVEL:
         return None
@@ -175,11 +178,13 @@ def _score_novelty(stored: ModelVersion, item: StoredDecision | None) -> Novelty
 def _restore_rule(stored: ModelVersion, policy: Policy) -> DecisionRule | None:
     """Return the decision rule of a policy with the state that a version stored.
 
-    Returns None if the version has no state that fits this rule: it stored another rule, none (it
-    is another cell's), or the rule was stale (it had missed an update). Also None if the rule is a
-    user's class whose module is not imported yet, since nothing is imported here. A rule that
-    learns nothing needs no state. Raises SettingError if an object of the user's class cannot be
-    made; an error of its constructor other than TypeError is raised as it is.
+    A state fits the rule if its arrays have the names and shapes of the rule's; whether it was
+    stored under the same policy is not checked. Returns None if the version has no such state: it
+    stored another rule, none (it is another cell's, or a baseline), or the rule was stale (it had
+    missed an update). Also None if the rule is a user's class whose module is not imported yet,
+    since nothing is imported here. A rule that learns nothing needs no state. Raises SettingError
+    if an object of the user's class cannot be made; an error of its constructor other than
+    TypeError is raised as it is.
     """
     if policy.guarantee not in RULES and policy.guarantee.partition(":")[0] not in sys.modules:
         # Nothing is imported because a store names it; a running engine has imported it.
@@ -198,12 +203,13 @@ def _restore_thresholds(
     """Return the thresholds of a version's rule after it was updated with later labels.
 
     They are (accept, reject): a part was accepted if lower >= the first, rejected if 1 - upper >=
-    the second. Labels of quarantined traces and of rejected parts that somebody inspected do not
-    update the rule. The rule "local" with stops="some" learns nothing, so both thresholds are the
-    policy's lower bound; but if the version stored the state of another rule, the result is None.
-    Of any other rule the result is None if `_restore_rule` returns None, or if the rule is no
-    `MemberRule`: only rules of this class have thresholds. Raises SettingError like
-    `_restore_rule`.
+    the second; if both held, a `MemberRule` had it verified. Labels of quarantined traces, labels
+    of rejected parts that somebody inspected, and overdue checks do not update the rule. The rule
+    "local" with stops="some" learns nothing, so both thresholds are the policy's lower bound; but
+    if the version stored the state of another rule, the result is None. Of any other rule the
+    result is None if `_restore_rule` returns None, or if the rule is no `MemberRule`: only rules of
+    this class have thresholds. Raises what `_restore_rule` raises, and what a user's rule raises in
+    an update.
     """
     has_state = bool(arrays_with_prefix(stored.state, "rule."))
     if (policy.guarantee, policy.stops) == ("local", "some") and not has_state:
@@ -223,9 +229,9 @@ def load_rule(store: SqlStore, policy: Policy) -> DecisionRule | None:
     If a label was corrected or a check is overdue, the stored rule cannot be continued, and a fresh
     one is updated with all outcomes (for all such cases see `RuleProgress.last_seq`). The updates
     may begin or end a safe mode of the returned rule; a fresh rule starts in the safe mode in which
-    it began before (`EvidenceWindow.began_in`). Nothing is written to the store, except an event if
-    the arrays of a version are damaged; then the version before it is taken. The store's ledger is
-    not checked.
+    it began before (`EvidenceWindow.began_in`). Nothing is written to the store, except records
+    that wait in its outbox, and an event if the arrays of a version are damaged; then the version
+    before it is taken. The store's ledger is not checked.
 
     Parameters
     ----------
@@ -235,11 +241,12 @@ def load_rule(store: SqlStore, policy: Policy) -> DecisionRule | None:
     Returns
     -------
     DecisionRule or None
-        None before the first version, and if a user's class of rule is not imported. Also None if
-        the newest version has no state that fits the rule: another cell of the product made it, it
-        was made under another policy, or the rule was stale (it had missed an update). A rule that
-        learns nothing, like that of "local" with stops="some", has no state: another cell's version
-        will do for it, and it is never stale.
+        None if there is no version, or none whose arrays are kept and intact, and if a user's class
+        of rule is not imported. Also None if the newest version has no arrays with the names and
+        shapes of the rule's: another cell of the product made it, it is a baseline, it was made
+        under a policy whose rule has other arrays, or the rule was stale (it had missed an update).
+        A rule that learns nothing, like that of "local" with stops="some", has no arrays: another
+        cell's version will do for it, and it is never stale.
 
     Raises
     ------
@@ -247,7 +254,7 @@ def load_rule(store: SqlStore, policy: Policy) -> DecisionRule | None:
         If the store cannot be read.
     SettingError
         If an object of the user's class of rule cannot be made. An error of its constructor
-        other than TypeError is raised as it is.
+        other than TypeError, and what its `observe` and `update` raise, is raised as it is.
     ValueError
         For a stored setting that must be a number and is none.
     """

@@ -113,10 +113,11 @@ def _find_thresholds(circumstances: Circumstances) -> tuple[float | None, float 
 
     `circumstances` are the settings of the engine, and the thresholds of its rule, at a decision. A
     part was accepted if lower >= the first, rejected if upper <= the second. Under the guarantee
-    "local", outside safe mode (or if its reason is not kept), they are LB and 1 - LB; else those of
-    the version's rule at that time. Both are None if they are unknown: they are not kept, a user's
-    rule decided, or a handed-in model decided by its own method. Otherwise the first is None if
-    nothing could be accepted, the second if nothing could be rejected; both may be.
+    "local", outside safe mode (or in one whose reason is not kept), they are LB
+    (`Policy.lower_bound`) and 1 - LB; else those of the version's rule at that time. Both are None
+    if they are unknown: they are not kept, a user's rule decided, or a model that the user handed
+    in decided by its own method. Otherwise the first is None if nothing could be accepted, the
+    second if nothing could be rejected; both may be.
     """
     policy = circumstances.recipe.policy
     if circumstances.baseline or policy.guarantee not in RULES:
@@ -140,9 +141,10 @@ def explain_in_words(
     """Yield the sentences that explain a decision: its reason, its bounds, its outcome.
 
     `circumstances` are the settings and the state of the engine at the decision. If `bound` is
-    None, the sentences on bounds are left out. The outcome is the label as corrected by now, or
-    that nothing was reported, which it also says of a forgotten label. Raises SettingError for a
-    part outside the force limits if one does not fit the trace, which `item` must have.
+    None, the sentences on bounds are left out. The last sentence is on the label as corrected
+    by now; without a label, or if it was forgotten, it says that nothing was reported. `item` must
+    have its trace. Raises SettingError for a part outside the force limits if one of these limits
+    does not fit the trace.
     """
     decision = item.decision
     reason = _explain_reason(decision, item.trace, circumstances)
@@ -156,9 +158,10 @@ def explain_in_words(
 
 
 def _explain_reason(decision: Decision, trace: TraceArray, circumstances: Circumstances) -> str:
-    """Return the end of the sentence that begins with what was done, like "Rejected": why.
+    """Return the reason of a decision, as text that follows "Accepted", "Rejected" or "Verified".
 
-    Raises SettingError for a part outside the force limits if one does not fit the trace.
+    It says so if the force limit or the alarm is not known. Raises SettingError for a part outside
+    the force limits if one of these limits does not fit the trace.
     """
     if decision.reason is Reason.OUTSIDE:
         left = " and ".join(_limits_left(trace, circumstances)) or "which is not known"
@@ -209,9 +212,10 @@ def _bound_sentences(
     """Yield the sentences on the labels near a trace, on the bounds, and on their thresholds.
 
     `circumstances` are the settings of the engine at the decision. If nothing could be accepted or
-    rejected, or the thresholds are unknown, the sentences say so. For a handed-in model that
-    decides by its own method there is one sentence, with its counts and bounds. An interval is
-    rounded outward to three decimals.
+    rejected, or the thresholds are unknown, the sentences say so. For a model that the user handed
+    in and that decides by its own method there is one sentence, with its counts and bounds. Under
+    the guarantees "pooled" and "cost" two equal bounds are given as one number, the mean of the
+    heads. An interval is rounded outward to three decimals.
     """
     n = decision.n_success + decision.n_failure
     interval = "{:.3f} to {:.3f}".format(*outward(decision.lower, decision.upper, 3))

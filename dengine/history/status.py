@@ -352,9 +352,9 @@ def status(store: SqlStore, last: int = NEWEST, watching: bool = False) -> Statu
     """Read the status of an engine from its store.
 
     A damaged label among those since the newest retrain is left out, and an event is written to the
-    store. An event is also written if the arrays of the newest version are read (with `watching`,
-    and if a rollback, release or change of policy made it) and are damaged; then those of the
-    version before it are taken.
+    store. The arrays of the newest version are read with `watching`, and also if a rollback, a
+    release or a change of policy made this version. If they are damaged, an event is written, too,
+    and those of the version before it are taken.
 
     Parameters
     ----------
@@ -374,12 +374,12 @@ def status(store: SqlStore, last: int = NEWEST, watching: bool = False) -> Statu
     Raises
     ------
     StoreError
-        For a store that no engine has used, for a damaged `TraceSpec` or a recipe that lacks
-        settings, and if the database fails.
+        For a store that no engine has used, for a damaged `TraceSpec`, a recipe that lacks settings
+        or another stored value that cannot be read, and if the database fails.
     SettingError
         For a stored recipe that cannot be read; with `watching` also if an object of the user's
-        class of rule cannot be made. An error of the rule's constructor other than TypeError is
-        raised as it is.
+        class of rule cannot be made. An error of the rule's constructor other than TypeError, and
+        any error of its `observe` or `update`, is raised as it is.
     ValueError
         For a stored setting that must be a number and is none.
     """
@@ -431,7 +431,7 @@ def status(store: SqlStore, last: int = NEWEST, watching: bool = False) -> Statu
 
 
 def _read_pinned(store: SqlStore, accepted: list[RetrainReport]) -> int:
-    """Return the number of the version that a rollback put in force; 0: none is pinned.
+    """Return the number of the earlier version that a rollback put in force again, else 0.
 
     `accepted` holds the reports of all versions that were put in force, oldest first. If the newest
     of them was trained, nothing is pinned, and no arrays are read. If the arrays of the newest
@@ -541,13 +541,14 @@ def _verdict(lower: float, upper: float, tolerance: float) -> str:
 def bad_accepts(outcomes: Outcomes, policy: Policy) -> ErrorEstimate:
     """Estimate the share of bad parts among those that the model would have accepted.
 
-    These are the accepted parts, and the audited ones that would have been accepted; `n` counts
-    both. If the outcomes of all accepted parts are known, the estimate rests on these outcomes.
-    Under `stops="all"` (every bad part stops the line) one known outcome is enough; accepted parts
-    without a report are then left out. Otherwise the estimate rests on the audits, because the
-    audit draw does not depend on the outcome. Line stops then move the interval: its lower end is
-    at least the one that follows if all other accepted parts were good, and its upper end at least
-    the share of line stops among the accepted parts.
+    These are the accepted parts, and the audited parts that have a label and would have been
+    accepted; `n` counts both. A forgotten label does not count. If the outcomes of all accepted
+    parts are known, the estimate rests on these outcomes. Under `stops="all"` (every bad part stops
+    the line) one known outcome is enough; accepted parts without a report are then left out.
+    Otherwise the estimate rests on the audits, because the audit draw does not depend on the
+    outcome. Line stops, the accepted parts that are known to be bad, then move the interval: its
+    lower end is at least the one that follows if all other accepted parts were good, and its upper
+    end at least the share of line stops among the accepted parts.
 
     Parameters
     ----------
@@ -588,11 +589,12 @@ def read_watch(store: SqlStore, recipe: Recipe, mode: Event | None) -> Watch | N
     traces began, all three are 0.
 
     The text `recovery` says how many parts since the alarm (10,001 are counted at most) count as
-    evidence, how many of these were decided wrongly, and after about how many more parts the safe
-    mode ends; or that the evidence is enough, or that it does not end, if it would take more than
-    10,000 more parts. It is "" outside safe mode. `mode` is the newest event at which a safe mode
-    began or ended; without it `recovery` is "". Raises what `load_rule` raises, and may write an
-    event to the store as it does.
+    evidence, for how many of these accepting (rejecting, after an alarm about rejected parts) would
+    have been wrong, and after about how many more parts the safe mode ends; or that the evidence is
+    enough, or that the safe mode does not end, if it would take more than 10,000 more parts. It is
+    "" outside safe mode. `mode` is the newest event at which a safe mode began or ended; without it
+    `recovery` is "". Raises what `load_rule` and a user's rule raise, and may write an event to the
+    store as `load_rule` does.
     """
     from ..decision.member_rules import MemberRule  # torch
     from .past_versions import load_rule
@@ -691,9 +693,13 @@ def history(store: SqlStore, last: int | None = None, **where: Any) -> Iterator[
     Raises
     ------
     SettingError
-        For a value that a field cannot have, and for a `last` below 1 or from 10 ** 9 on.
+        For an action, reason, label or predicted action that does not exist, and for a `last` below
+        1 or from 10 ** 9 on. Other values are not checked.
     TypeError
         For a name that is no field.
+    StoreError
+        For a stored value that cannot be read, and if the database fails; if `last` is None, during
+        the iteration.
     """
     expect(
         last is None or 1 <= last < MAX_LAST,
@@ -728,7 +734,7 @@ def iterate_decisions(
         Id of a decision: the iteration starts with the next decision in its direction. For an id
         that the cell does not have nothing is yielded. None: it starts with the newest or oldest.
     newest_first : bool, default True
-        False: oldest first.
+        False: oldest first. Decisions that are made during the iteration are then yielded, too.
 
     Yields
     ------
@@ -738,7 +744,7 @@ def iterate_decisions(
     Raises
     ------
     StoreError
-        For a stored value that cannot be read.
+        For a stored value that cannot be read, and if the database fails.
     """
     while page := store.decisions.select(where, page_size, start_after, newest_first):
         if newest_first:

@@ -442,7 +442,8 @@ class BaselinePredictor(nn.Module):
 
         Returns the positions of action and reason in `ACTIONS` and `REASONS`, the bounds of the
         success probability, the label counts n_success and n_failure, and an embedding that is
-        always empty, shape (0, 0). The reason is UNCERTAIN for VERIFY, otherwise CERTAIN. `part`
+        always empty, shape (0, 0). The baseline gets the samples of `x` without a copy, so what it
+        writes to them changes `x`. The reason is UNCERTAIN for VERIFY, otherwise CERTAIN. `part`
         has no effect, because a baseline knows nothing of parts. Raises ValueError for an unknown
         action, for other than one value of each bound or count, and for counts that are not whole
         numbers from 0 to 2**63 - 1 (OverflowError for an infinite count). Of several actions the

@@ -135,8 +135,9 @@ class Predictor(nn.Module):
         n_failure of the labels within the radius, and the embedding (K, d), divided by the scale of
         each embedding space. Several labels of one part may count as fewer. If the rule only sorts
         parts and the reducer gives a probability of success (`RadiusNeighbours.scored`), both
-        bounds are this score. A novel trace is verified without counting: its bounds are 0 and 1,
-        its counts are 0.
+        bounds are the mean of this probability over the K spaces; for a rule with `prior_labels` it
+        is drawn towards 1/2 while few references are known. A novel trace is verified without
+        counting: its bounds are 0 and 1, its counts are 0.
         """
         z = self.embed(x)
         if self.novelty(x):
@@ -171,8 +172,9 @@ def template_of(eager: Decider, warm_up_shape: tuple[int, ...]) -> Any:
     takes tens of milliseconds. The new template then decides three times on a trace of shape
     `warm_up_shape` (C, T) whose samples rise from 0 to 1, so that later calls are fast. The process
     keeps it, and drops the oldest if there were 16 (`KINDS`) before. All deciders of a structure
-    have the same template, so do not change it: `compiled` copies it. Raises what `script` raises
-    if TorchScript cannot compile the decider, and torch.jit.Error if it cannot run.
+    have the same template, which shares the tensors of the decider that was compiled, so do not
+    change it: `compiled` copies it. Raises what `script` raises if TorchScript cannot compile the
+    decider, and torch.jit.Error if it cannot run.
     """
     structure = structure_of(eager)
     if (template := _COMPILED.get(structure)) is None:
@@ -209,7 +211,8 @@ def _as_key(value: object) -> object:
     A list, tuple or dict gives its type and the sorted names and keys of its items. The key of an
     item is the text of a constant (`CONSTANTS`, like a number or a text), the shape of a tensor,
     and else its own `_as_key`. A function is its own key: its address would not do, since another
-    function may get it later. Any other value, and so a constant outside a container, gives None.
+    function may get it later. Any other value gives None. `structure_of` passes the dict of a
+    module's attributes, so constants and tensors come only as items.
     """
     if isinstance(value, FUNCTIONS):
         return value
@@ -248,7 +251,7 @@ def compiled(eager: Decider, warm_up_shape: tuple[int, ...]) -> Any:
 def compare_points(decider: Decider, X: Floats, points: Floats) -> str:
     """Compare the embeddings of a decider with the points of a reducer.
 
-    What the decider raises is raised.
+    Raises what the decider raises, and ValueError if there are not as many points as traces.
 
     Parameters
     ----------
@@ -261,8 +264,8 @@ def compare_points(decider: Decider, X: Floats, points: Floats) -> str:
     Returns
     -------
     str
-        A sentence on what is wrong; "" if the two agree on each trace (`is_close`, within 0.001) in
-        which the decider finds no fault.
+        A sentence on what is wrong; "" if the two agree on each trace in which the decider finds no
+        fault: no coordinate is NaN, and each may differ by 0.001 times (1 + its absolute value).
     """
     for x, expected in zip(X, points, strict=True):
         with torch.inference_mode():
@@ -342,12 +345,14 @@ class ModelPrediction(EngineModel):
 
     @classmethod
     def from_recipe(cls, recipe: Recipe, seed: int = 0) -> Self:
-        """Return the untrained model that a `Recipe` describes; `seed` is for the reducer.
+        """Return the untrained model that a `Recipe` describes.
 
-        Reducer, radius, folds, novelty, policy and decision rule are the recipe's; `recipe.window`
-        is the largest number of references. The class of a user is imported. Raises SettingError if
-        the reducer or the rule cannot be made; other errors of the constructor of a user's class
-        are raised as they are.
+        `seed` is the `random_state` of a reducer that the recipe names, if its class takes that and
+        `params` do not set it; it has no effect on a reducer that is an object. Reducer, radius,
+        folds, novelty, policy and decision rule are the recipe's; `recipe.window` is the largest
+        number of references. A user's class, of the reducer or the rule, is imported. Raises
+        SettingError if the reducer or the rule cannot be made; other errors of the constructor of a
+        user's class are raised as they are.
         """
         policy = recipe.policy
         classifier = WilsonRadiusClassifier(
@@ -387,9 +392,9 @@ class ModelPrediction(EngineModel):
         """Train the reducer from scratch, and make the traces the references in place of the old.
 
         If there are more traces than the classifier's capacity, only the last become references.
-        The scales of the embedding spaces and the novelty gate are computed anew as well, the
-        decision rule stays as it is. If the training raises, the reducer is left untrained: call
-        `fit` again.
+        Extreme samples, also infinite ones, are clipped first (`clip_extremes`). The scales of the
+        embedding spaces and the novelty gate are computed anew as well, the decision rule stays as
+        it is. If the training raises, the reducer is left untrained: call `fit` again.
 
         Parameters
         ----------
@@ -410,9 +415,11 @@ class ModelPrediction(EngineModel):
             If the reducer cannot be trained: there are too few traces, or, for some reducers, a
             single class. If 20 traces or more are all of one part.
         TraceError, DataError
-            If the shape of X is another, and if a label is neither 1 nor 0.
+            If X has another shape or no real numbers, or all samples are below 1e-12 but not all
+            are 0; and if a label is neither 1 nor 0.
         ValueError
-            If there are not as many labels as traces, and if a sample is not finite.
+            If there are not as many labels as traces, and if a sample is NaN. Other errors of a
+            user's transformer are raised as they are.
         """
         X = as_traces(X)
         y = as_labels(y)
@@ -432,14 +439,16 @@ class ModelPrediction(EngineModel):
 
         A reducer that can go on from its last training does so. If there are more traces than the
         classifier's capacity, only the last become references. `index`, `scale` (the divisor of the
-        points in each embedding space), `gate` (the novelty gate, disabled if `novelty` is 0),
-        `examples` (up to 8 of the traces), the `repeats_note` of `report` and `trace_shape` are
-        replaced, the decider is dropped and built anew when it is used, and the decision rule stays
-        as it is. y (n,) are labels, 1 or 0; `hashes` (n,), of the parts, give the folds; `numbers`
-        (n,), of the labels, are kept with the references; `stop` may end the reducer's training
-        early. Extreme samples are clipped first. Raises what the reducer's `train` raises, such as
-        SettingError if it cannot be trained on these traces, and SettingError if 20 traces or more
-        are all of one part. If the reducer raises, it may be changed already; all else is not.
+        points in each embedding space), `gate` (the novelty gate, disabled if `novelty` is 0, or
+        for too few traces, see `fit_novelty`), `examples` (up to 8 of the traces), the
+        `repeats_note` of `report` and `trace_shape` are replaced, the decider is dropped and built
+        anew when it is used, and the decision rule stays as it is. y (n,) are labels, 1 or 0;
+        `hashes` (n,), of the parts, give the folds; `numbers` (n,), of the labels, are kept with
+        the references, and by them the reducer finds what `precompute` kept; `stop` may end the
+        reducer's training early. Extreme samples are clipped first. Raises what the reducer's
+        `train` raises, such as SettingError if it cannot be trained on these traces, and
+        SettingError if 20 traces or more are all of one part. If the reducer raises, it may be
+        changed already; all else is not.
         """
         X = clip_extremes(X)
         y = y.astype(np.int64)
@@ -477,10 +486,10 @@ class ModelPrediction(EngineModel):
 
         `numbers` are the labels' sequence numbers, by which the reducer finds its results again;
         without them a reducer of dengine keeps none. Samples far larger than usual are clipped
-        first (`clip_extremes`). Before the first training, if reducer and decision rule can be
-        compiled, a decider without references is compiled as well, because the first retrain has no
-        time for that; the process keeps it as a template (`template_of`). Raises what `template_of`
-        and the reducer raise.
+        first (`clip_extremes`). Before the first training, if the reducer gives an
+        `untrained_module` and the decision rule is `scriptable`, a decider without references is
+        compiled as well, because the first training has no time for that; the process keeps it as a
+        template (`template_of`). Raises what `template_of` and the reducer raise.
         """
         X = clip_extremes(X)
         encoder = self.spaces.untrained_module(X)
@@ -500,9 +509,10 @@ class ModelPrediction(EngineModel):
 
         If the rule of either model is stale, because an update of it failed, this model is stale
         afterwards. The decider is built for the `DecisionConditions` under which the previous model
-        decided, or, if that never decided, for those of this model. A decider that this model has
-        already, with the same rule and for the same conditions, is kept. Nothing happens if the
-        previous model is no `ModelPrediction`. Raises what `build_decider` raises.
+        decided, or, if that never decided, for those of this model, if it has any. A decider that
+        this model has already, with the same rule and for the same conditions, is kept. Nothing
+        happens if the previous model is no `ModelPrediction`. Raises what `build_decider` raises;
+        the rule is taken over all the same.
         """
         if not isinstance(previous, ModelPrediction):
             return
@@ -590,10 +600,11 @@ class ModelPrediction(EngineModel):
 
         `y` is 1 for success, 0 for failure. The hash of the trace's content gives the fold and
         stands for the part. The reducer is not trained, and a full index drops its oldest
-        reference. Samples are not checked: a NaN makes a reference of NaN. Returns self. Raises
-        ValueError if nothing was fitted, TraceError for a trace of another shape or length, or not
-        of real numbers, and ReportError for another label; also what `build_decider` raises, if no
-        decider is kept.
+        reference. Samples are neither checked nor clipped here: a NaN makes a reference of NaN, but
+        some reducers that embed in Python raise ValueError for it. Returns self. Raises ValueError
+        if nothing was fitted or the rows of the trace have different lengths, TraceError for a
+        trace of another shape or length, or not of real numbers, and ReportError for another label;
+        also what `build_decider` raises, if no decider is kept.
         """
         X = as_traces(np.asarray(x)[None], self.trace_spec)
         hash_ = int(content_hash(X)[0])
@@ -617,9 +628,10 @@ class ModelPrediction(EngineModel):
         both divided by the scale already; without both it is computed from the trace. A full index
         drops its oldest reference. `y` is 1 for success, 0 for failure; `number` is the sequence
         number of this label. Returns the reference point, float32 (d,), divided by the scale of the
-        space. If it must be computed, the trace's shape is not checked, and a decider is built and
-        kept if none is, which raises what `build_decider` raises (ValueError or AttributeError if
-        nothing was fitted). Otherwise raises AttributeError if nothing was fitted.
+        space. If it must be computed, the reducer's encoder gets the trace unchecked and may raise
+        errors of its own, and a decider is built and kept if none is, which raises what
+        `build_decider` raises (ValueError or AttributeError if nothing was fitted). Otherwise
+        raises AttributeError if nothing was fitted.
         """
         # The fold of a hash is also the space of its reference.
         fold = int(fold_of(hash_, self.n_spaces))
@@ -715,9 +727,10 @@ class ModelPrediction(EngineModel):
 
         Returns action, bounds of the success probability, label counts, embedding (K, d) and
         reason, as a `Prediction`. References of the part with the hash `hash_` are not counted; 0
-        excludes none. The trace's shape is not checked. A decider is built and kept if none is.
-        Raises RuntimeError if the decision rule is stale, because an update of it failed,
-        ValueError if nothing was fitted, and what `build_decider` raises.
+        excludes none. The trace is not checked, and what the reducer's encoder or the rule raises
+        is raised. A decider is built and kept if none is. Raises RuntimeError if the decision rule
+        is stale, because an update of it failed, and what `build_decider` raises (ValueError or
+        AttributeError if nothing was fitted).
         """
         with torch.inference_mode():
             predicted = self.predictor(torch.from_numpy(x), hash_)
@@ -731,10 +744,10 @@ class ModelPrediction(EngineModel):
     def decide_one(self, x: Floats, part_hash: int, conditions: DecisionConditions) -> Verdict:
         """Decide on one raw trace x (C, T), in the unit of the sensor, under these conditions.
 
-        The decider, the module that decides, is built first if the one that the model keeps is for
-        other conditions. References of the part with the hash `part_hash` are not counted. 0 stands
-        for an unknown part: then references with the same content hash as the trace are not
-        counted.
+        The decider, the module that decides, is built first, and kept, unless the model keeps a
+        decider for these conditions. References of the part with the hash `part_hash` are not
+        counted. 0 stands for an unknown part: then references with the same content hash as the
+        trace are not counted.
 
         Returns
         -------
@@ -746,9 +759,9 @@ class ModelPrediction(EngineModel):
         ------
         RuntimeError
             If the decision rule is stale, because an update of it failed, and the trace has no
-            fault. A faulty trace is verified without the rule.
+            fault, even if a force limit decides. A faulty trace is verified without the rule.
         ValueError, ...
-            As in `build_decider`.
+            What `build_decider`, the reducer's encoder or the rule raises.
         """
         decider = self.decider(conditions)
         # As `torch.inference_mode`, whose entering costs 3 % of a decision.
@@ -818,11 +831,11 @@ class ModelPrediction(EngineModel):
         The references must be finite, and the points to which the reducer maps `examples`, some
         training traces, must not be NaN. A reducer that is restored from the state of this one must
         map `examples` to the same points, twice in a row; each coordinate may differ by 1e-5 times
-        (1 + its absolute value). If a reducer gives no state, it must do so itself. The points,
-        divided by the scale of their embedding space, are kept for `check_answers`, unless a
-        reference is not finite. If restoring raises a StoreError, that is a defect; other errors
-        are raised. Call it right after a training: a restored model has no `examples`, and some
-        reducers raise TraceError then.
+        (1 + its absolute value). If this reducer gives no state, it is itself asked twice in place
+        of a restored reducer. The points, divided by the scale of their embedding space, are kept
+        for `check_answers`, unless a reference is not finite. If restoring raises a StoreError,
+        that is a defect; other errors are raised. Call it right after a training: a restored model
+        has no `examples`, and some reducers raise TraceError then.
         """
         if not np.isfinite(self.index.column("points")).all():
             return "the embedding of a reference is not finite"
@@ -870,15 +883,15 @@ class ModelPrediction(EngineModel):
     def set_state(self, state: Arrays) -> Self:
         """Restore the state that `get_state` returned; returns self.
 
-        References, scale (the divisor of the points in each embedding space), decision rule (in
-        place) and novelty gate are restored, and the reducer if the state holds it. If it does not
-        (`needs_refit`), train this model on the same traces before this call. The decider is
-        dropped, and `examples` stay. An index with a smaller capacity keeps the newest references.
-        If the rule was stale, the state does not hold it, and this model's rule stays as it is;
-        `rule_is_stale` always stays as it is. Raises StoreError if the state holds no reducer
-        although this fitted reducer gives a state, and for a rule or gate of other sizes. For the
-        state of another reducer it raises StoreError, KeyError, ValueError or NotImplementedError.
-        After an error do not use the model.
+        Trace shape, references, scale (the divisor of the points in each embedding space), decision
+        rule (in place) and novelty gate are restored, and the reducer if the state holds it. If it
+        does not (`needs_refit`), train this model on the same traces before this call. The decider
+        is dropped, and `examples` stay. An index with a smaller capacity keeps the newest
+        references. If the state has no arrays of a rule, because the rule was stale or has no
+        tensors, this model's rule stays as it is; `rule_is_stale` always stays as it is. Raises
+        StoreError if the state holds no reducer although this fitted reducer gives a state, and for
+        a rule or gate of other sizes. For the state of another reducer it raises StoreError,
+        KeyError, ValueError or NotImplementedError. After an error do not use the model.
         """
         if not self.needs_refit(state):
             self.spaces.set_state(arrays_with_prefix(state, "reducer."))
@@ -909,17 +922,17 @@ class ModelPrediction(EngineModel):
 
 
 def near_repeats(traces: Floats, parts: NDArray[np.int64]) -> int:
-    """Count those of the newest 500 traces that nearly repeat one of another part among them.
+    """Count the traces among the newest 500 that nearly repeat a trace of another part.
 
     Labels are counted as independent trials, so the number of a part that is inserted again must be
     given (`part=`). This function notices plain cases in which it was not; no decision depends on
     it. A trace is compared with the traces of other parts only, by the distance between the means
     of 50 to 99 stretches of samples (fewer if there are fewer samples), from which the mean over
-    all traces is subtracted, in units of the standard deviation of the channel. It nearly repeats
-    one if the nearest of them is nearer than 0.12 times the distance to the eleventh nearest
-    (`NEAR`, `NEIGHBOURS`), and that distance is above 1e-6. So a trace with more than 10 near
-    repeats does not count, and a trace that has only 1 to 10 traces of other parts to compare with
-    counts.
+    all traces is subtracted, in units of the standard deviation of the channel. A trace counts if
+    the nearest of them is nearer than 0.12 times the distance to the eleventh nearest (`NEAR`,
+    `NEIGHBOURS`), and the eleventh nearest is farther than 1e-6. So a trace with 11 or more equally
+    near traces does not count. If there are only 1 to 10 traces of other parts, the eleventh counts
+    as infinitely far, so the trace counts.
 
     Parameters
     ----------

@@ -115,9 +115,9 @@ def _check_parameter(default: Any, key: str, value: Any) -> None:
     """Raise SettingError unless a reducer's parameter `key` may have this value.
 
     The value must have the type of `default`; if that is a float, any number but NaN will do.
-    `folds` must lie between 2 and 1000, any other integer within 32 bits. If the default is
-    neither str, int nor float, as None is, the value is not checked. Without the check, a wrong
-    value would make every retrain fail.
+    `folds` must lie between 2 and 1000, any other integer within 32 bits. If the default is of
+    any other type than str, int and float, for example None or a boolean, the value is not checked.
+    Without the check, a wrong value would make every retrain fail.
     """
     integers = (2, 1000) if key == "folds" else (-MAX_INTEGER, MAX_INTEGER)
     checks = {

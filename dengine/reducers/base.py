@@ -316,7 +316,8 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
         X : array or DataFrame, shape (n, T) or (n, C, T)
         reset : bool, default False
             Whether these traces set the shape that later ones must have, as in `fit`:
-            `trace_shape_` and scikit-learn's `n_features_in_`. At least one trace is then needed.
+            `trace_shape_`, and scikit-learn's `n_features_in_` and, for a DataFrame whose columns
+            have names, `feature_names_in_`. At least one trace is then needed.
 
         Returns
         -------
@@ -332,11 +333,11 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
             table without columns, or a table or array (n, T) with other columns than in `fit`. With
             `reset`, if there is no trace.
         TypeError
-            If X is sparse.
+            If X is sparse, or has an object that is neither a real number nor a text, like a dict.
         TraceError
             If X has more than three dimensions, or (n, C, T) no channels or no samples. If X has
-            another number of channels or samples than in `fit`. With `reset`, if all samples are
-            below 1e-12 but not all are 0, because float32 hardly holds their squares.
+            another number of channels or samples than in `fit`. With `reset`, if no absolute value
+            reaches 1e-12 but not all samples are 0, because float32 hardly holds their squares.
         """
         if not reset:
             check_is_fitted(self)
@@ -433,10 +434,11 @@ def space_scale(points: Floats, folds: Ints, n_spaces: int) -> Floats:
     """Return the scale of each embedding space: the root mean square radius of its points.
 
     The radius is the distance from their mean. Space k has the points of fold k. Outliers are left
-    out, since a single one would draw all other points together. Outliers are the points more than
-    50 times as far from the median as the median distance; distances are measured along the axis on
-    which they are largest. If these are several, and more than 5 % of the fold's points, none is
-    left out.
+    out, since a single outlier could make the scale so large that all other scaled points nearly
+    coincide. A point is an outlier if its distance from the median point (the median of each
+    coordinate) is more than 50 times the median of these distances; such a distance is the largest
+    absolute difference of a coordinate. If there are several outliers, and they are more than 5 %
+    of the fold's points, none is left out.
 
     Parameters
     ----------
@@ -450,8 +452,8 @@ def space_scale(points: Floats, folds: Ints, n_spaces: int) -> Floats:
     Returns
     -------
     array of float32, shape (K,)
-        1 for a fold without points, or if their spread is not finite or not above rounding errors,
-        about 1e-6 of the largest coordinate.
+        1 for a fold without points, or if the root mean square radius is not finite or not above
+        rounding errors, about 1e-6 of the largest coordinate.
     """
     scale = np.ones(n_spaces, dtype=np.float32)
     for k in range(n_spaces):
@@ -520,9 +522,9 @@ def binary_labels(y: Any, n: int, name: str) -> Ints:
 def folds_of(traces: Floats, n_folds: int, folds: Any = None) -> Ints:
     """Return the folds of traces (n, C, T), int64 (n,): those given, or by a hash of each trace.
 
-    Given folds are cast to int64. Raises SettingError unless there is one for each trace, and each
-    is one of 0 to n_folds - 1; what NumPy raises for folds that are no numbers. A fold may have no
-    trace.
+    Given folds are cast to int64, so decimals are cut off. Raises SettingError unless there is a
+    fold for each trace, and each is from 0 to n_folds - 1, and raises what NumPy raises for folds
+    that are no numbers. A fold may have no trace.
     """
     if folds is None:
         return content_fold(traces, n_folds)
@@ -536,9 +538,9 @@ def check_classes(labels: Ints, masks: NDArray[np.bool_]) -> None:
     """Raise SettingError unless, for each fold, the labels (n,) outside it have both classes.
 
     Row k of `masks`, bool (K, n), tells which labels are outside fold k. The message asks for more
-    labels, and names the first such fold. If no label is outside a fold, it says instead that all
-    traces are the same, which puts them into one fold, and asks to check the sensor and the unit of
-    measurement.
+    labels, and names the first fold outside which a class is missing. If no label is outside this
+    fold, it says instead that all traces are the same, which puts them into one fold, and asks to
+    check the sensor and the unit of measurement.
     """
     for fold, outside in enumerate(masks):
         n_classes = len(np.unique(labels[outside]))
@@ -557,8 +559,9 @@ def check_classes(labels: Ints, masks: NDArray[np.bool_]) -> None:
 def draw_seed(random_state: Any) -> int:
     """Return a seed for NumPy and torch from scikit-learn's `random_state`.
 
-    An integer is the seed itself. A RandomState draws the seed, so it gives another one at each
-    call; None stands for NumPy's global generator. Raises SettingError for anything else.
+    An integer is the seed itself, and its range is not checked. A RandomState draws the seed, so it
+    gives another seed at each call; None stands for NumPy's global generator. Raises SettingError
+    for anything else.
     """
     if isinstance(random_state, int | np.integer):
         return int(random_state)
@@ -682,6 +685,7 @@ class CrossFitted(_Wrapping):
         Parameters
         ----------
         X : array of float, shape (n, T) or (n, C, T)
+            Clones that are no `Reducer` get it as rows (n, C * T).
         y : array, shape (n,)
             Labels of two classes; the clones get 1 for the one that sorts last, else 0.
         folds : array of int64, shape (n,), optional
@@ -697,9 +701,9 @@ class CrossFitted(_Wrapping):
             If K is below 2, the labels are missing or not of two classes, folds do not fit the
             traces, or the traces outside a fold have a single class.
         TraceError, ValueError, TypeError
-            If X is not of one of these shapes or sparse, a value is not finite, or all samples are
-            below 1e-12 but not all are 0 (`check_traces`). Errors of the clones are raised as they
-            are.
+            If X has another shape, has no trace or is sparse, if a value is not finite, or if no
+            absolute value reaches 1e-12 but not all samples are 0 (`check_traces`). Errors of the
+            clones are raised as they are.
         """
         expect(self.folds >= 2, "folds >= 2 for a reducer that uses labels", self.folds)
         traces = self.check_traces(X, reset=True)

@@ -217,7 +217,7 @@ class ConvReducer(TorchReducer):
         It does what `TorchReducer._build` does, after making `rocket_`, a `RocketReducer` that is
         not initialised yet. The networks have initial weights. `average` is the number of samples
         that are averaged to one. Without `seed` the seed of the networks comes from `random_state`.
-        Raises SettingError as `TorchReducer._build` does.
+        Raises SettingError as `TorchReducer._build` does; `rocket_` has been replaced by then.
         """
         # Before `encoder_`, by which other threads see that there is a module.
         self.rocket_ = RocketReducer(

@@ -101,7 +101,7 @@ class RidgeProblem:
         regression, whose Hessian depends on `p` (n,), the probabilities that head k gives. It
         covers the rows that train the head, and has the ridge on its diagonal. The product of
         features is computed in float32, since a Newton step may be inexact. Raises
-        torch.linalg.LinAlgError if the sum is not positive definite, for example if it has a NaN.
+        torch.linalg.LinAlgError if the Hessian is not positive definite, or has a NaN.
         """
         curvature = (self.mask[k] * p * (1.0 - p)).float()
         product = (self.g32 * curvature[:, None]).T @ self.g32  # a step need not be exact
@@ -148,8 +148,8 @@ def fit_heads(
     max_iter : int
         Largest number of steps.
     stop : StopRule
-        Asked before each step, which all heads take together. The steps also end when all heads
-        have converged, or after `max_iter`.
+        Asked before each step, which all heads take together; if it has a deadline, its `late` and
+        `last_step` are set. The steps also end when all heads have converged, or after `max_iter`.
     min_steps : int, default 0
         Number of first steps that the deadline of `stop` does not prevent.
 
@@ -157,6 +157,11 @@ def fit_heads(
     -------
     HeadsFit
         Weights, leave-one-out logits, number of steps.
+
+    Raises
+    ------
+    torch.linalg.LinAlgError
+        If the Hessian of a head is not positive definite, for example if a feature is NaN.
     """
     problem = RidgeProblem.from_features(g, y, outside, l2)
     # Every head takes part in every product, whether it has converged or not: a product of another

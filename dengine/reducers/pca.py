@@ -60,9 +60,9 @@ class PcaReducer(Reducer):
             If there are `n_components` traces or fewer, or if a trace has fewer samples than that,
             all channels together.
         TraceError, ValueError, TypeError
-            If X is not of one of these shapes or sparse, a value is not finite, or all samples are
-            below 1e-12 but not all are 0 (`check_traces`). ValueError also for a parameter that
-            scikit-learn refuses, such as `n_components=0`.
+            If X has another shape, has no trace or is sparse, if a value is not finite, or if no
+            absolute value reaches 1e-12 but not all samples are 0 (`check_traces`). ValueError also
+            for a parameter that scikit-learn refuses, such as `n_components=0`.
         """
         rows = as_rows(self.check_traces(X, reset=True))
         largest = min(len(rows) - 1, rows.shape[1])

@@ -54,7 +54,7 @@ class ProbabilityReducer(Reducer):
         return int(self.folds)
 
     def fit(self, X: ArrayLike, y: ArrayLike | None = None, *, folds: Ints | None = None) -> Self:
-        """Draw kernels or weights anew and train them; earlier trainings are discarded.
+        """Build the model anew and train it; earlier trainings are discarded.
 
         If it raises, earlier trainings may be lost already, as after SettingError for a single
         class. Unlike `train` it takes fewer than 20 traces, too.
@@ -75,10 +75,10 @@ class ProbabilityReducer(Reducer):
         Raises
         ------
         SettingError
-            If a parameter is out of its range, labels or folds do not fit the traces, or a trace
-            has a single sample. `TorchReducer`: if the network does not give (B, features), the
-            checkpoint cannot be used, or fewer than two traces lie outside a fold. `RocketReducer`:
-            if the traces outside a fold have a single class.
+            If a parameter is out of its range, y is None, labels or folds do not fit the traces, or
+            a trace has a single sample. `TorchReducer`: if the network does not give (B, features),
+            the checkpoint cannot be used, or fewer than two traces lie outside a fold.
+            `RocketReducer`: if the traces outside a fold have a single class.
         TraceError, ValueError, TypeError
             If X is not of one of these shapes or sparse, a value is not finite, or all samples are
             below 1e-12 but not all are 0 (`check_traces`).
@@ -105,11 +105,11 @@ class ProbabilityReducer(Reducer):
         return untrained.module()
 
     def _check_and_initialize(self, X: Floats) -> Floats:
-        """Check traces and return them as (n, C, T); initialise the model at the first call.
+        """Check traces, initialise the model if need be, and return the traces as (n, C, T).
 
-        The first traces set the shape and the scales of the channels; no label is read. The first
-        call raises SettingError for fewer than 20 traces, and what `_initialize` raises. Raises the
-        errors of `check_traces`.
+        The traces that initialise it set the shape and the scales of the channels; no label is
+        read. If it must be initialised, SettingError is raised for fewer than 20 traces, and what
+        `_initialize` raises. Raises the errors of `check_traces`.
         """
         if not self.is_initialized_:
             do = "verify more parts first"

@@ -322,13 +322,14 @@ class RocketReducer(ProbabilityReducer):
     ) -> Floats:
         """Fit the classifier heads, starting from their last weights; return the reference points.
 
-        The kernels are drawn at the first call of `train` or `precompute` and stay. X are traces
-        (n, C, T), y (n,) their labels 1 or 0, `folds` (n,) their folds. `numbers` (n,), those of
-        the labels, increasing, identify the traces: a trace that was in the last call of `train` or
-        `precompute` has its features in a cache. None: nothing is cached, and traces are chosen by
-        their rows. `stop` may end the Newton steps, but in the first fit its deadline leaves them
-        three. If there are more than 4000 traces, the heads are fitted to 4000 of them, chosen by a
-        hash of the numbers. The module `net_`, and so the module that `module` returned before, is
+        The kernels are drawn at the first call of `train` or `precompute`, unless `fit` or
+        `set_state` has set them, and stay. X are traces (n, C, T), y (n,) their labels 1 or 0,
+        `folds` (n,) their folds. `numbers` (n,), those of the labels, increasing, identify the
+        traces: a trace that was in the last call of `train` or `precompute` has its features in a
+        cache. None: nothing is cached. `stop` may end the Newton steps, but in the first fit up to
+        three are taken even after its deadline. If there are more than 4000 traces, the heads are
+        fitted to 4000 of them, chosen by a hash of the numbers, or of the row indices if there are
+        no numbers. The module `net_`, and so the module that `module` returned before, is
         changed in place. The points are float32 (n, d), row i in embedding space ``folds[i]``.
         Raises the errors of `check_traces`, and SettingError for fewer than 20 traces, if the
         traces outside a fold have a single class, and at the first call for a parameter out of its
@@ -357,9 +358,10 @@ class RocketReducer(ProbabilityReducer):
         """Make the module `net_` for traces of this shape, with kernels and classifier heads of 0.
 
         `towers_` and the cache of features become empty, `n_fits_` and `n_component_traces_` 0;
-        what a fit reports (`n_iter_`, `holdout_losses_`) stays. `is_initialized_` becomes False
-        until the caller has set the kernels. `average` is the number of samples that are averaged
-        to one. Raises SettingError for a parameter out of its range or fewer than 2 samples.
+        what a fit reports (`n_iter_`, `holdout_losses_`) stays. `trace_shape_`, `n_features_in_`
+        and `average_` are set. `is_initialized_` becomes False; the caller sets the kernels, and
+        then makes it True. `average` is the number of samples that are averaged to one. Raises
+        SettingError for a parameter out of its range or fewer than 2 samples.
         """
         self.check()
         self.trace_shape_ = (channels, samples)
@@ -541,9 +543,10 @@ class RocketReducer(ProbabilityReducer):
 
         They are float32, computed from the outputs of the kernels. `numbers` (n,), those of the
         labels, increasing, identify the traces: only features that the cache lacks are computed.
-        They must be neither -1 nor out of order, which is not checked. Afterwards the cache holds
-        the features of these traces and no others; the tensor that is returned shares its memory.
-        Without numbers the cache is neither read nor written.
+        The numbers must be neither -1 nor out of order, which is not checked; the array is kept,
+        not copied. Afterwards the cache holds the features of these traces and no others; the
+        tensor that is returned shares its memory. Without numbers the cache is neither read nor
+        written.
         """
         encoder = self.net_.encoder
         with torch.no_grad():
@@ -618,7 +621,7 @@ class RocketReducer(ProbabilityReducer):
         range, StoreError if an array of `net_` is missing or has a size that does not follow from
         the parameters, ValueError if a `Tower` lacks an array, and KeyError if the shape, the
         counters (of fits, traces and steps) or the losses (log loss of each space) are missing. The
-        sizes of a tower's arrays are not checked. After an error the fitted model is lost.
+        sizes of a tower's arrays are not checked. After an error the fitted model may be lost.
         """
         channels, samples = self.restore_shape(state)
         average, *counts = map(int, state["counts"])
@@ -635,10 +638,10 @@ class RocketReducer(ProbabilityReducer):
     def check(self) -> None:
         """Raise SettingError for a parameter out of its range.
 
-        These are integers: `kernels`, `dilations`, `width` and `max_iter` from 1 to a
-        billion, `regions` from 1 to 16, `groups` from 0 to 64, `n_components` 1 or 2, and `folds`
-        from 2 to 1000. `l2` is above 0; TypeError is raised if it cannot be compared with 0.
-        `random_state` is not checked.
+        `kernels`, `dilations`, `width` and `max_iter` must be integers from 1 to a billion,
+        `regions` from 1 to 16, `groups` from 0 to 64, `n_components` 1 or 2, and `folds` from 2 to
+        1000; booleans and floats are refused. `l2` must be above 0; TypeError is raised if it
+        cannot be compared with 0. `random_state` is not checked.
         """
         check_integers(
             self,
@@ -660,9 +663,9 @@ def sample_rows(n: int, numbers: Ints | None) -> Ints | slice:
     They are int64 (4000,), increasing. If there are no more rows than that, the result is instead
     ``slice(None)``, which selects all. The same arguments give the same rows.
 
-    A hash of the labels' numbers (n,) draws them, old and new labels alike. So most rows are those
-    of the last fit, and the heads start near their final weights. If `numbers` is None, they are 0
-    to n - 1.
+    `numbers` (n,) are the numbers of the rows' labels, the same in every training; None stands for
+    0 to n - 1. The rows whose numbers have the smallest hashes are drawn, old and new labels alike.
+    So most rows are those of the last fit, and the classifier heads start near their final weights.
     """
     if n <= MAX_TRAINING_TRACES:
         return slice(None)

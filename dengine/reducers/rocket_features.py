@@ -157,13 +157,13 @@ class RocketEncoder(nn.Module):
         return self.scale_features(self.raw_features(x))
 
     def raw_features(self, x: Tensor) -> Tensor:
-        """Raw traces (B, C, T) -> unscaled features (B, P) of tower 1, then those of tower 2.
+        """Compute unscaled features (B, P) of raw traces (B, C, T): of tower 1, then of tower 2.
 
-        The features of tower 1 are from 0 to 3: sums of two means of the outputs of kernels, each
-        output limited to 0 to 1 (`ramp_features`). Those of tower 2 say which kernels of a group
-        have the largest and the smallest outputs (`competition_features`). If `groups` is 0, there
-        is no tower 2.
-        `scale_features` standardises the features.
+        The features of tower 1 are from 0 to 3: the mean over a region, plus twice the mean over
+        the whole trace, of a kernel's outputs, which are limited to 0 to 1 (`ramp_features`). Those
+        of tower 2 say how often each kernel of a group has the largest, and how often the smallest
+        output (`competition_features`). If `groups` is 0, there is no tower 2. `scale_features`
+        standardises the features.
         """
         values = self.read_taps(self.average_samples(x))
         n_dense = self.n_dense_taps
@@ -277,7 +277,8 @@ class RocketEncoder(nn.Module):
         `rng` draws the kernels, and the traces that are read: at most 256 for the scales, and 64 of
         these for the thresholds. A channel x is then scaled to scale * x + shift, with mean 0 and
         deviation 1; one that never moves is only shifted. Call this method once: a second call sets
-        everything anew, and the features of every trace change.
+        all of these anew, and the features of every trace change. `gain` and `offset`, which scale
+        the features, are not set here; `learn_feature_scales` sets them.
         """
         if len(X) > SCALE_TRACES:
             X = X[torch.from_numpy(rng.permutation(len(X))[:SCALE_TRACES])]
@@ -299,7 +300,9 @@ class RocketEncoder(nn.Module):
         groups, `competing_kernel`. Thresholds, which only tower 1 has, are quantiles of the
         outputs, from 5 to 95 %. A kernel of tower 1 is scaled so that the ramp around its
         threshold, on which its answer rises from 0 to 1, is two standard deviations of its outputs
-        wide; those of tower 2 are scaled so that all outputs of a dilation have the deviation 1.
+        wide. `threshold` holds 0.5 minus the threshold in this scale; it is added to the scaled
+        output. The kernels of tower 2 are scaled so that all outputs of a dilation together have
+        the deviation 1.
         """
         # `x` is scaled already; averaging is linear, so the scale is taken out again.
         values = self.read_taps(self.average_samples((x - self.shift) / self.scale))  # (C, taps, n)

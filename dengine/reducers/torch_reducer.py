@@ -240,9 +240,9 @@ class TorchReducer(ProbabilityReducer):
 
         Earlier trainings are discarded; no label is read. The preprocessor averages and scales the
         samples; its scales are computed from the traces. The weights are read from the checkpoint,
-        if one is given, and otherwise drawn from the seed. Raises SettingError for a parameter out
-        of its range, fewer than 2 samples, a network that does not give (B, features), or a
-        checkpoint that cannot be used.
+        if one is given, and otherwise drawn from the seed. At the end `is_initialized_` becomes
+        True. Raises the errors of `_build`, and SettingError for a checkpoint that cannot be used;
+        then `is_initialized_` is False.
         """
         x = torch.from_numpy(traces)
         self._build(traces.shape[1], traces.shape[2], averaging(x))
@@ -299,12 +299,13 @@ class TorchReducer(ProbabilityReducer):
     ) -> Floats:
         """Take `steps` steps on traces (n, C, T), or fewer if `stop` ends them; replace `encoder_`.
 
-        The networks with averaged weights and new statistics of batch normalisation become
-        `encoder_`. `n_steps_left_` becomes 0 if `stop` limits the number of steps, else the number
-        of steps that are missing until training is complete. `labels` (n,) are 1 or 0, `folds` (n,)
-        the folds; `numbers` is not read. Returns the points of the traces, float32 (n, d), row i in
-        embedding space ``folds[i]``. Raises SettingError for fewer than two traces outside a fold;
-        `encoder_` and the counts of steps stay then.
+        `fit_loop` takes the steps, and its docstring says what they change. Then the networks with
+        averaged weights and new statistics of batch normalisation become `encoder_`, also if no
+        step was taken. `n_steps_left_` becomes 0 if `stop.max_steps` is set, else the number of
+        steps that are missing until training is complete. `labels` (n,) are 1 or 0, `folds` (n,)
+        the folds, 0 to K - 1; `numbers` is not read. Returns the points of the traces, float32
+        (n, d), row i in embedding space ``folds[i]``. Raises SettingError for fewer than two traces
+        outside a fold; `encoder_` and the counts of steps stay then.
         """
         with torch.no_grad():
             x: Tensor = self.preprocessor_(torch.from_numpy(traces))
@@ -443,8 +444,9 @@ class TorchReducer(ProbabilityReducer):
     def _embed_in_fold_space(self, x: Tensor, folds: Ints) -> Floats:
         """Embed preprocessed traces (n, C', L), each in one embedding space: float32 (n, d).
 
-        Row i is in space ``folds[i]``, as a reference; folds must be 0 to K - 1. Network k computes
-        the rows of fold k alone, so this takes 1 / K of the time of `embed`.
+        Row i is the point of trace i in space ``folds[i]``. Folds must be 0 to K - 1, which is not
+        checked; rows of other folds are undefined. Network k computes the rows of fold k alone, so
+        this takes 1 / K of the time of `embed` if the folds are equally large.
         """
         rows_of_fold = [torch.from_numpy(np.flatnonzero(folds == k)) for k in range(self.folds)]
         points = torch.empty(len(x), self.n_components)
@@ -474,7 +476,7 @@ class TorchReducer(ProbabilityReducer):
         It is the present `encoder_`, which later trainings replace and do not change. None if
         TorchScript cannot compile the network: the first call finds this out, and logs a warning,
         unless a warning for this network and shape was logged before (`compile_fault`). Raises
-        NotFittedError before a fit, and TypeError if `network` is not hashable.
+        NotFittedError before there are networks, and TypeError if `network` is not hashable.
         """
         check_is_fitted(self, "encoder_")
         shape = self.preprocessor_.channels, self.preprocessor_.samples
@@ -486,11 +488,11 @@ class TorchReducer(ProbabilityReducer):
     def report(self) -> FitReport:
         """Return the report of the last training: its steps, the steps still missing, and a note.
 
-        Steps are missing until training is complete (36 and 1.2 for each label, at most
-        `fit_steps`, over all trainings); 0 if the caller limited the steps. The note gives the loss
-        and the number of all steps so far if the last training took a step, and the number of
-        missing steps if there are any. If neither holds, it is "". Raises NotFittedError before a
-        fit.
+        Training is complete after 36 steps plus 1.2 for each label, but at most `fit_steps`, over
+        all trainings. If the caller limited the steps of the last training, none counts as missing.
+        The note gives the loss and the number of all steps so far if the last training took a step,
+        and the number of missing steps if there are any. If neither holds, it is "". Raises
+        NotFittedError before there are networks.
         """
         check_is_fitted(self, "encoder_")
         note = f"loss {self.loss_:.3f} after {self.n_steps_} steps" if self.n_new_steps_ else ""
@@ -503,7 +505,7 @@ class TorchReducer(ProbabilityReducer):
 
         They are shape, counters, loss, and the tensors of preprocessor, networks, averaged networks
         and optimiser, so that training can go on. They include the points of a fixed trace, by
-        which `set_state` recognises the network. Raises NotFittedError before a fit.
+        which `set_state` recognises the network. Raises NotFittedError before there are networks.
         """
         check_is_fitted(self, "encoder_")
         counts = [self.preprocessor_.average, self.seed_, self.n_steps_]

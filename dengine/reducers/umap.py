@@ -136,10 +136,10 @@ class UmapEncoder(nn.Module):
     def embed_frames(self, frames: Tensor) -> Tensor:
         """Embed traces, each a vector of F frames, among the references: (B, F) -> (B, dim).
 
-        A trace starts at the mean of its nearest references' points, weighted by their membership
-        strengths. It is then moved five times to the mean of the same points, weighted by how
-        strongly UMAP attracts it to each of them at its current distances (whose squares are raised
-        by 0.001).
+        A trace starts at the mean of the points of its `n_neighbors` nearest references, weighted
+        by their membership strengths. It is then moved five times to the mean of the same points,
+        weighted by how strongly UMAP attracts it to each of them at its current distances (whose
+        squares are raised by 0.001).
         """
         # Half the squared distances, less half the squared norm of each trace.
         half_squared = self.half_norms - frames @ self.references.T
@@ -264,11 +264,12 @@ class UmapReducer(Reducer):
         Raises
         ------
         SettingError
-            If a parameter is out of its range, or there are `n_neighbors` or `n_components` traces
-            or fewer.
+            If a parameter is out of its range, `random_state` is of another type, or there are
+            `n_neighbors` or `n_components` traces or fewer.
         TraceError, ValueError, TypeError
             If X is not of one of these shapes or sparse, a value is not finite, or all samples are
-            below 1e-12 but not all are 0 (`check_traces`).
+            below 1e-12 but not all are 0 (`check_traces`). ValueError also for a negative
+            `random_state`.
         """
         traces = self._check(X, reset=True)
         self._initialize(traces)
@@ -289,10 +290,12 @@ class UmapReducer(Reducer):
         training; labels and folds are not read. The layout goes on from the last one if at least
         half of the traces were in it; otherwise, or without `numbers`, it starts anew; if none of
         them was in the last search of neighbours, or without `numbers`, the seed and the frames are
-        new as well. `stop` may end the epochs; after its deadline at most ten more are taken. What
-        `precompute` found is used and then dropped. Returns the points of the traces, float32 (n,
+        new as well. It takes `n_epochs_due` epochs, or fewer if `stop` ends them; after the
+        deadline of `stop` at most ten more are taken. What `precompute` found is used, unless seed
+        and frames are new, and then dropped. Returns the points of the traces, float32 (n,
         n_components), which share their memory with `embedding_`. Raises the errors of
-        `check_traces`, and SettingError for a parameter out of its range, or too few traces.
+        `check_traces`, SettingError for a parameter out of its range, a `random_state` of another
+        type or too few traces, and ValueError for a negative `random_state`.
         """
         traces = self._check(X, reset=not self._is_fitted)
         if numbers is None or not self._has_searched_any(numbers):
@@ -354,7 +357,7 @@ class UmapReducer(Reducer):
         `random_state` gives the seed; the counters of epochs become 0. A frame is the sum of a
         short stretch of samples. The number of frames of a trace and their centre and scale come
         from at most 256 of the traces, evenly spaced. An earlier `encoder_` stays until the next
-        training replaces it.
+        training replaces it. Raises SettingError for a `random_state` of another type.
         """
         sample = traces[:: 1 + len(traces) // CHUNK]
         self.make_frames_ = frames_for(sample)
@@ -518,8 +521,9 @@ class UmapReducer(Reducer):
         """Restore what `get_state` returned, and return self; the parameters must be the same.
 
         What `precompute` found is dropped. Raises StoreError if the arrays of `Frames`, the module
-        that averages traces, have other sizes than the shape of the traces in `state` asks for,
-        KeyError if another array is missing. The parameters are not compared with the state.
+        that averages traces, are missing or have other sizes than the shape of the traces in
+        `state` asks for, and KeyError if another array is missing; the reducer may be partly
+        changed by then. The parameters are not compared with the state.
         """
         channels, samples = self.restore_shape(state)
         n_frames, *counts = map(int, state["counts"])

@@ -56,7 +56,8 @@ def spectral_start(
     graph : csr_matrix of float32, shape (n, n)
         The fuzzy simplicial set.
     frames : Tensor of float32, shape (n, F)
-        Frames of the traces, for the principal components.
+        Averages of each trace over stretches of samples (`umap_graph.Frames`), for the principal
+        components.
     n_components : int
         Dimension of the points.
     rng : numpy.random.Generator

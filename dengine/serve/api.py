@@ -36,6 +36,7 @@ from ..errors import (
     TraceConflictError,
     TraceError,
     UnknownDecisionError,
+    VersionError,
     as_options,
     log,
     shortened,
@@ -46,7 +47,7 @@ from ..history.map import PartMap
 from ..history.status import Course, Status
 from ..records import Action, TraceArray
 from ..representation import to_jsonable
-from ..store.records import Correction, Event, StoredDecision, StoredVersion, VersionError
+from ..store.records import Correction, Event, StoredDecision, StoredVersion
 from ..traces import LARGEST
 from .service import ReportResponse, ServiceResponse
 
@@ -122,9 +123,9 @@ async def read_body(request: Request, struct_type: type[T]) -> T:
 
     The body must be an object without nested objects; the media type is not checked. Raises
     HTTPException: 400 for a body that is no JSON or has a name twice, 422 for a missing field, an
-    unknown one, and a value that the type does not take. Raises ClientDisconnect if the client goes
-    away before the whole body has come, and HTTPException 413 while it is read, if `Guard` finds it
-    too large.
+    unknown name (if `struct_type` forbids unknown fields), and a value that the type does not take.
+    Raises ClientDisconnect if the client goes away before the whole body has come, and
+    HTTPException 413 while it is read, if `Guard` finds it too large.
     """
     body = await request.body()
     try:
@@ -270,9 +271,9 @@ def _json_field_types(record: type) -> Json:
 def _json_type(hint: Any) -> Any:
     """Return the type that a value of the Python type `hint` has in JSON, as msgspec writes types.
 
-    A dataclass becomes a struct type, a list or a tuple a list of its first item's type, and a
-    float may be null. In `X | Y` both types are converted. Other types are returned as they are.
-    The result is cached.
+    A dataclass becomes a struct type. `list[X]` and `tuple[X, ...]` become a list type; of a tuple
+    with several types only the first type counts. `float` becomes `float | None`. In `X | Y` both
+    types are converted. Other types are returned as they are. The result is cached.
     """
     if isinstance(hint, type) and is_dataclass(hint):
         return _response_type(hint.__name__, "", hint)
@@ -437,10 +438,10 @@ def _error_response(request: Request, error: Any) -> Response:
     """Return the response that `problem_response` makes for an exception of a request.
 
     An HTTPException has a status, a text and headers of its own; but for the statuses 404 and 405,
-    which only starlette raises, dengine has its own text. For other errors the status is the one
-    that `STATUSES` has for their type, with the error's text, in which Python's arguments are
-    written as options (`as_options`: `rate_hz=500` becomes `--rate-hz 500`). Any other exception
-    gets 500 with a general text, and is logged with its traceback.
+    which only starlette raises, dengine has its own text. Another error gets the status of the
+    first type in `STATUSES` that it is an instance of, and its own text, in which Python's
+    arguments are written as options (`as_options`: `rate_hz=500` becomes `--rate-hz 500`). An
+    exception of no such type gets 500 with a general text, and is logged with its traceback.
     """
     if isinstance(error, HTTPException):
         detail = NO_ROUTE.get(error.status_code, error.detail)
@@ -536,10 +537,11 @@ class Operation:
     def describe(self, schemas: Json) -> Json:
         """Return the operation as an OpenAPI operation object, a dict.
 
-        It has the summary, the responses (200, and for any other status a problem, the JSON object
-        that tells an error), and for a POST the request's body. The fields are parameters of a GET,
-        and of a POST whose body may be bytes; only those in the path are marked as required.
-        `schemas` has the JSON schema of every request type and response by name.
+        It has the summary (the handler's docstring), the responses (200, and for any other status a
+        problem, the JSON object that tells an error), and for a POST the request's body. The fields
+        are parameters of a GET, and of a POST whose body may be bytes, except the field that gets
+        these bytes; only fields in the path are marked as required. `schemas` has the JSON schema
+        of every request type and response by name.
         """
         request_schema = schemas[self.request_type.__name__]
         if self.response in RESPONSES:

@@ -152,9 +152,10 @@ def names_this_machine(host: str) -> bool:
     """Return whether a request's `Host` header is localhost or a loopback address, with or without
     a port, in small or capital letters.
 
-    It is False for "" and for brackets without an address; what stands before an `@`, and behind a
-    colon, `/`, `?` or `#`, is not checked. It is False as well for a web page of another site whose
-    name was made to resolve to this machine (DNS rebinding): the browser sends that name as `Host`.
+    It is False for "", for brackets without an address and for an IPv6 address without brackets;
+    what stands before an `@`, and behind a colon, `/`, `?` or `#`, is not checked. It is False as
+    well for a web page of another site whose name was made to resolve to this machine (DNS
+    rebinding): the browser sends that name as `Host`.
     """
     try:
         return is_loopback(urlsplit(f"//{host}").hostname or "")

@@ -41,8 +41,8 @@ async def playing(service: CellService, data: Any, seed: int) -> AsyncIterator[N
 
     Raises
     ------
-    DataError
-        If the recordings cannot be read.
+    DataError, SettingError, ValueError, StoreError
+        If the recordings cannot be read (see `load_dataset`).
     """
     cell = ReplayCell(data)
     cell.order = np.random.default_rng(seed).permutation(len(cell.data))
@@ -55,8 +55,7 @@ async def playing(service: CellService, data: Any, seed: int) -> AsyncIterator[N
 
 
 async def drive(service: CellService, cell: ReplayCell) -> None:
-    """Insert every part of a data set once, ask the service for a decision, and report the
-    outcome.
+    """Insert every part of a data set once, ask for a decision, and report the outcome.
 
     `cell` plays them, in the order of `cell.order`, from its first part on; parts have the numbers
     "0001", "0002" and so on. The recorded result is reported for verified parts, and for accepted

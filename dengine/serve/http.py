@@ -196,7 +196,7 @@ class HttpApi:
         nothing else). Only the newest 20 decisions on the part are looked at. A decision's id in
         place of the part's number is found, too, if no part has this number. For a part it
         waits in the queue, and raises BusyError if that is full or the service is closing, and
-        StoreError. An id is not looked up.
+        StoreError if the store cannot be read. An id is neither looked up nor checked.
         """
         if bool(id_) == bool(part):
             raise HTTPException(
@@ -218,9 +218,9 @@ class HttpApi:
         already counts with this label, nothing changes, but a training under way begins again. Only
         the newest 20 decisions on a part are looked at. 404: an unknown id or part; 409: a part
         with several decisions that are no rejects, or with nothing but several rejects; 422: a
-        decision without a label, both or neither of id and part, no author (unless the token has a
-        name), or an author that is not the token's; 503: the queue is full, the store does not
-        answer, or the decision's trace is damaged.
+        decision without a label, both or neither of id and part, no author of 1 to 200 printable
+        characters (unless the token has a name), or an author that is not the token's; 503: the
+        queue is full, the store does not answer, or the decision's trace is damaged.
         """
         decision_id = await self._find_id(id_, part)
         return await self._change(
@@ -239,12 +239,13 @@ class HttpApi:
         /correct makes a forgotten label count again. If the id of one decision is unknown (404), a
         decision has no label, or no id is given (422), no label is forgotten. 422 also for a
         request without an author, unless the token has a name, and for an author that is not the
-        token's, is longer than 200 characters or not printable. The certificate goes on to count a
-        forgotten outcome of a certain decision, as wrong. In the reason each run of white space
-        becomes a space. If a rollback pinned the version in force, and this was trained with one of
-        the labels, it is released, so that retrains may replace it. A training under way begins
-        again, even if the labels are forgotten already; no event is recorded then. 503: the queue
-        is full, the store does not answer, or the trace of a decision is damaged.
+        token's, is longer than 200 characters or not printable. The certificate, which bounds the
+        errors of the decisions, goes on to count a forgotten outcome of a certain decision, as
+        wrong. In the reason each run of white space becomes a space. If a rollback pinned the
+        version in force, and this was trained with one of the labels, or one is older than all that
+        it was trained with, it is released, so that retrains may replace it. A training under way
+        begins again, even if the labels are forgotten already; no event is recorded then. 503: the
+        queue is full, the store does not answer, or the trace of a decision is damaged.
         """
         line = " ".join(reason.split())
         return await self._change(
@@ -292,9 +293,9 @@ class HttpApi:
         A pinned version is released, so that the new version may replace it. If a retrain is under
         way already, or was asked for and cannot begin yet, the response says so, and nothing
         changes. If no other process can train, the response comes after the retrain. /versions
-        tells afterwards whether the new version was put in force or dropped. 422: no author (unless
-        the token has a name), or an author that is not the token's. 503: the queue is full, or the
-        store does not answer.
+        tells afterwards whether the new version was put in force or dropped. 422: no author of 1 to
+        200 printable characters (unless the token has a name), or an author that is not the
+        token's. 503: the queue is full, or the store does not answer.
         """
 
         def begin(engine: DataEngine, by: str) -> Changed:
@@ -323,8 +324,9 @@ class HttpApi:
     ) -> Json:
         """Return how the cell is doing: counts of decisions, version, faults, queue and alarm.
 
-        The counts are of all decisions, and of the newest 500. 422: the stored recipe cannot be
-        read; 503: the queue is full, the server is closing, or the store cannot be read.
+        The counts are of all decisions, and of the newest 500; the alarm is the most urgent thing
+        that somebody should look at, empty if there is none. 422: the stored recipe cannot be read;
+        503: the queue is full, the server is closing, or the store cannot be read.
         """
         status = await self.service.status(watch)
         line = {name: getattr(self.service, name) for name in api.LINE}
@@ -356,7 +358,8 @@ class HttpApi:
         have done) and part (the part's number) are returned, if these are given, and only those
         between the times since (included) and until (not included), in seconds since 1970. With
         open, label and action are ignored. 422: a value that a field cannot have, or an invalid
-        `before`; 503: the queue is full, or the store cannot be read.
+        `before`; 503: the queue is full, the store cannot be read, or the trace of the decision
+        `before` is damaged.
         """
         selection = HistoryFilter(**where)
         if open_:
@@ -431,8 +434,9 @@ class HttpApi:
     async def changes(self) -> Response:
         """Return a stream of server-sent events, which ends when the server ends.
 
-        The first is hello, with the server's version. Then comes changed, at once and after each
-        change, and tick after each 5 seconds without a change. Nothing says what has changed.
+        The first is hello, with the server's version. Then comes changed, at once and whenever
+        decisions, reports, changes by hand (also refused ones) or retrains have come since the last
+        event, and tick after each 5 seconds without any. Nothing says what has changed.
         """
 
         async def event_stream() -> AsyncIterator[str]:
@@ -458,10 +462,11 @@ class HttpApi:
     async def healthz(self) -> Response:
         """Return whether the engine answers: ok or degraded (200), down (503). It needs no token.
 
-        Degraded: the store or its journal cannot be written, the store differs from its ledger, or
-        the last three or more retrains were dropped. Down: the engine's thread has ended, or was
-        busy with one thing for a minute. The texts of the faults, and the number of requests in the
-        queue, come with it.
+        Degraded: the store, or the journal (the file that takes its records first), cannot be
+        written or does not answer in time, the store differs from its ledger (a hash chain of its
+        rows), or the last three or more retrains were dropped. Down: the engine's thread has ended,
+        or was busy with one thing for a minute. The texts of the faults, and the number of requests
+        in the queue, come with it.
         """
         running = self.service.engine.state
         is_alive = self.service.silent_seconds < MAX_SILENT
@@ -557,20 +562,22 @@ def create_app(
     *,
     recorder: RtdeRecorder | None = None,
 ) -> Starlette:
-    """Create the application. The caller closes the service after it has ended.
+    """Create the Starlette application that serves a cell.
 
     It serves the operations of `HttpApi`, XML-RPC at POST /RPC2 (`RobotCalls`), and the web page.
-    Every request first passes `Guard`; errors become `Problem`s. The service gets an observer,
-    which counts its responses for `GET /metrics`.
+    Every request first passes `Guard`. Errors become `Problem`s, and those of an XML-RPC call
+    become faults. The service gets an observer, which counts its responses for `GET /metrics`. The
+    caller closes the service after the application has ended.
 
     Parameters
     ----------
     service : CellService
     tokens : tuple of Token, optional
-        Empty: no request needs a token. Serve the application at a loopback address alone then;
+        Empty: no request needs a token, and `Guard` refuses requests whose host is neither
+        localhost nor a loopback address. Serve the application at a loopback address alone then;
         this is not checked here.
     recorder : RtdeRecorder, optional
-        Records the traces for `decide_recorded`; the caller closes it.
+        Records the traces for `decide_recorded`; the caller closes it. None: that call is a fault.
 
     Returns
     -------

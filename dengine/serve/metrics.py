@@ -102,9 +102,10 @@ class Metrics:
     def collect(self) -> Iterator[Metric]:
         """Yield gauges and counters with the present state of the engine and its queue.
 
-        They say for example which version is in force, whether it is in safe mode, how many
-        requests wait, and how many were late or refused. Prometheus's registry calls this when the
-        metrics are read. It reads no database, so that it works while the store is unavailable.
+        They say for example which version is in force, whether the engine is in safe mode (it
+        verifies parts until new outcomes allow decisions), how many requests wait, and how many
+        were late or refused. Prometheus's registry calls this when the metrics are read. It reads
+        no database, so that it works while the store is unavailable.
         """
         service = self._service
         engine = service.engine

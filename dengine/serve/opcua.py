@@ -141,7 +141,7 @@ async def opcua_server(
         For an address that other machines can reach, unless there are an operator's token, a
         certificate and a key; and for a certificate and a key that `check_key_pair` refuses.
     OSError
-        For a port in use.
+        If the server cannot listen at this address, for example because the port is in use.
     """
     has_password = any(token.operates for token in tokens)
     if not (is_loopback(host) or (cert is not None and has_password)):

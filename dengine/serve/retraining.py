@@ -52,8 +52,8 @@ class RetrainingProcess(Executor):
     def _start(self) -> None:
         """Start a process that imports the modules that a retrain needs, and do not wait for it.
 
-        `ready` is set to a new future, which is done when the modules are imported. Raises OSError
-        if the process cannot be started.
+        `ready` is set to a new future, which is done when the modules are imported, and fails if
+        they cannot be or the process ends before. Raises OSError if the process cannot be started.
         """
         context = multiprocessing.get_context("spawn")
         self._pool = ProcessPoolExecutor(1, context, _prepare_process)
@@ -145,11 +145,12 @@ def _call(call: tuple[Callable[..., Any], tuple[Any, ...], dict[str, Any]]) -> _
 def _prepare_process() -> None:
     """Set up the retraining process; this runs in it before anything else.
 
-    From now on the process ends when the thread that started it ends (without Linux: the parent
-    process), even during a call into C++; it ends at once, with exit code 1, if its parent has
-    ended already. If the system allows it, the process leaves one of several cores to decisions and
-    has a lower priority. It ignores the signals that ask a process to end (`END_SIGNALS`): Ctrl-C
-    reaches all processes of a terminal, but the server ends this process in order.
+    From now on Linux kills the process when the thread that started it ends, even during a call
+    into C++; on another system it ends when its parent process ends. It ends at once, with exit
+    code 1, if its parent has ended already. If the system has the functions for it, the process
+    leaves one of several cores to decisions and has a lower priority. It ignores the signals that
+    ask a process to end (`END_SIGNALS`): Ctrl-C reaches all processes of a terminal, but the server
+    ends this process in order.
     """
     parent = multiprocessing.parent_process()
     assert parent is not None  # it was spawned

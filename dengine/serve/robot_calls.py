@@ -226,12 +226,13 @@ class RobotCalls:
     async def decide_recorded(self, request: Any = "", part: Any = "") -> Struct:
         """Decide on the trace that the recorder took of the insertion since `begin`.
 
-        If the id already has a decision, it is returned again. Otherwise the call waits up to
-        `RECORD_SECONDS` for the recording. Only the part of the newest `begin` has a recording, and
-        only for one call, even if that call times out, is refused or gets "busy". If there is no
-        recording, or the recorder fails, which is logged, the result is verify with an id "" and
-        the reason "not_recorded", and nothing is stored. An insertion that is incomplete after this
-        time has NaN for its missing samples, so it is verified and stored with that fault.
+        If the id already has a decision, it is returned again. Otherwise, or if the id cannot be
+        looked up now, the call waits up to `RECORD_SECONDS` for the recording. Only the part of the
+        newest `begin` has a recording, and only for one call, even if that call times out, is
+        refused or gets "busy". If there is no recording, or the recorder fails, which is logged,
+        the result is verify with an id "" and the reason "not_recorded", and nothing is stored. An
+        insertion that is incomplete after this time has NaN for its missing samples, so it is
+        verified and stored with that fault.
 
         Parameters
         ----------
@@ -333,9 +334,9 @@ class RobotCalls:
         Raises
         ------
         ReportError
-            For a report that contradicts an earlier one, unless it is a line stop after a
-            confirmation; for any report if a person had the label forgotten; for a value that is no
-            label; and for an invalid id.
+            For a report that contradicts an earlier label, unless it says bad of an accepted part
+            that was confirmed as good before; for any report if a person withdrew the label; for a
+            value that is no label; and for an invalid id.
         """
         if decision_id == "":  # of an unrecorded VERIFY
             return False
@@ -351,8 +352,9 @@ class RobotCalls:
     async def status(self) -> Struct:
         """Return how the cell is doing, in plain numbers and texts.
 
-        It waits in the queue. While the store is read no decision waits, unless the store is in
-        memory.
+        It waits in the queue until the engine has written all that it recorded, which may discard
+        a training or retrain the model (`CellService.read`). While the store is read no decision
+        waits, unless the store is in memory.
 
         Returns
         -------

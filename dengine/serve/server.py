@@ -113,22 +113,23 @@ def serve(
 
     Then the requests under way have `GRACE` (5) seconds to be answered; a SIGINT after another of
     these signals ends without waiting for them. The engine does what is in the queue, and is
-    closed. Logs go to stderr, a line
-    each, also after the end (`log_lines`). In another thread than the main thread no signal ends
-    it, and before it listens a signal ends the process as it does in any program.
+    closed. In a thread other than the main thread no signal ends the call. A signal that comes
+    before the server listens acts like in any other program. The handlers of the root logger are
+    replaced for good: every log message becomes a line on stderr (`log_lines`).
 
     Parameters
     ----------
     make : callable
         Opens the engine, given the executor that it retrains in, a process of its own.
     store : str or None
-        The store's name, for a second connection that only reads; None: a store in memory.
+        Name of the store that `make` opens, for a second connection that only reads; None: a store
+        in memory.
     say : callable
         Called with a line that says where the server listens, once it does.
     beside : sequence of callable
         Each is called with the service and returns an async context, which lasts as long as the
-        server, in the same event loop. If one fails to start, the server does not listen, and the
-        error is raised.
+        server, in the same event loop. If the start of a context fails, no request is answered, and
+        the error is raised.
     recorder : callable
         Returns a context manager that opens the recorder of a robot's insertions for as long as the
         server runs, or gives None.
@@ -142,23 +143,25 @@ def serve(
     cert, key : path or None
         PEM files for TLS, both or none.
     deadline : float
-        Seconds that a decision may wait in the queue.
+        Seconds that a decision may wait in the queue; after that its part is verified.
     check_seconds : float
-        Duration of a verification.
+        Duration of a verification, from which the saved time is computed.
     opcua : int or None
-        Port of OPC UA; None: off. The tokens of operators are its passwords, those of viewers not.
+        Port of OPC UA; None: off. Only the tokens of operators are its passwords.
     opcua_cert, opcua_key : path or None
         None: `cert` and `key`.
 
     Raises
     ------
     SettingError
-        For a port in use, files that cannot be used, and an address that other machines can reach
-        without a token.
+        For a port in use, files that cannot be used, only one of `cert` and `key`, and an address
+        that other machines can reach without a token; for OPC UA such an address needs the token of
+        an operator and a certificate.
     Exception
         What `make`, `recorder`, or a start of one of `beside` or of OPC UA raises, such as OSError
-        for its port in use; StoreError if the second connection to the store cannot be opened, and
-        OSError if the process for retrains cannot be started.
+        for its port in use; StoreError if the second connection to the store cannot be opened,
+        OSError if the process for retrains cannot be started, and ImportError for OPC UA without
+        asyncua.
     """
     if token_file is None and not is_loopback(host):
         raise SettingError(
@@ -265,10 +268,9 @@ def quick_switches() -> Iterator[None]:
 def listening_socket(host: str, port: int) -> Iterator[socket.socket]:
     """Open a listening TCP socket, yield it, and close it when the block ends.
 
-    The host is an address, or a name that has an address of IPv4.
-
-    Port 0 takes a free port. Raises SettingError if the socket cannot be opened, for example
-    because the port is in use or the host is unknown.
+    The host is an IPv4 address, an IPv6 address without brackets, or a name that has an IPv4
+    address. Port 0 takes a free port. Raises SettingError if the socket cannot be opened, for
+    example because the port is in use or the host is unknown.
     """
     with instead(
         SettingError,
@@ -288,8 +290,9 @@ def listening_socket(host: str, port: int) -> Iterator[socket.socket]:
 
 
 def log_safe_mode(reason: str) -> None:
-    """Log a warning that the safe mode began for this reason, or, if the reason is "", a message
-    that it ended.
+    """Log that the safe mode, in which parts are verified, began or ended.
+
+    `reason` says why it began, which is logged as a warning; "" means that it ended.
     """
     if reason:
         log.warning("safe mode, parts are verified until outcomes allow decisions: %s", reason)

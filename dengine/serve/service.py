@@ -66,8 +66,8 @@ class Job(NamedTuple):
     def run(self, engine: DataEngine) -> None:
         """Do the work with the engine, and set the future's result or exception.
 
-        If the future was cancelled, because its caller has timed out, the work is done too; its
-        result is dropped, and an exception is logged. Nothing is raised.
+        If the future was cancelled, because its caller timed out or was cancelled, the work is done
+        all the same; its result is dropped, and an exception is logged. Nothing is raised.
         """
         has_caller = self.future.set_running_or_notify_cancel()
         try:
@@ -228,7 +228,8 @@ class CellService:
         StoreError
             For an engine that is closed or in use by another thread.
         BusyError
-            If the queue is full or the service is closing; nothing is recorded.
+            If the queue is full, the service is closing, or the engine's thread has ended; nothing
+            is recorded.
         """
         begin = time.monotonic()
         id_ = uuid.uuid4().hex if request is None else as_id(request)
@@ -272,8 +273,8 @@ class CellService:
         Returns
         -------
         ReportResponse
-            It is also passed to each of `observers`, after the retrain that the label set off if
-            that is finished; what an observer raises is raised.
+            It is also passed to each of `observers`; what an observer raises is raised. They get
+            the report of the retrain that the label set off from the engine's thread (`_next_job`).
 
         Raises
         ------
@@ -284,8 +285,12 @@ class CellService:
             the same and that of a line stop.
         StoreError
             If the label is not known to be on disk, or the id cannot be looked up: report it again.
-            Also if the engine is closed, and if only the event cannot be stored; it is then missing
-            for good.
+            If the decision was not recorded because its id could not be looked up: decide again.
+            Also if the stored trace is damaged, if the engine is closed, and if only the event
+            cannot be stored; the event is then missing for good.
+        Exception
+            What the copying of a handed-in model raises, before a retrain; the label is on disk
+            then, and the event is missing.
         BusyError
             If the queue is full, the service is closing, or the engine's thread has ended.
         """
@@ -326,8 +331,6 @@ class CellService:
             return False, retrain
 
         repeated, retrain = await self.call(work)
-        if retrain is not None:
-            self._notify_observers(retrain)
         seconds = time.monotonic() - begin
         response = ReportResponse(decision_id, label, repeated, retrain, seconds)
         return self._notify_observers(response)
@@ -374,15 +377,14 @@ class CellService:
         return job.future
 
     async def read(self, work: Callable[[SqlStore], T]) -> T:
-        """Let the engine write all that it has recorded to the store, call `work` with the store,
-        and return what it returns.
+        """Have the engine write its records to the store, and return what `work(store)` returns.
 
         The writing (`DataEngine.flush`) waits in the queue. After a line stop or check that came
         late it also corrects the rule, and may discard a training or retrain the model. Records
         that the disk or the store does not take in time are missing, without an error. `work` must
         only read. It runs in another thread over a second connection to the store (`read_store`),
-        or in the engine's thread if the store is in memory. Raises BusyError if the queue is full
-        or the service is closing, and whatever `work` raises.
+        or in the engine's thread if the store is in memory. Raises BusyError if the queue is full,
+        the service is closing, or the engine's thread has ended, and whatever `work` raises.
         """
         with suppress(NotTakenError):
             await self.call(lambda engine: engine.flush(), read_only=True)
@@ -419,9 +421,10 @@ class CellService:
         """Yield True at once, and then whenever something has changed since the last yield.
 
         A change is each call of the engine that is not read-only, even if it raised, and each
-        retrain that has ended between two calls. What a read-only call changes, like the retrain
-        that `read` may do, is none. After `quiet` seconds without a change False is yielded. The
-        iteration ends when `end_listening` is called, and yields nothing if it was called before.
+        report that `DataEngine.poll` returns between two calls, also that of a retrain that `read`
+        has done. Anything else that a read-only call changes does not count. After `quiet` seconds
+        without a change False is yielded. The iteration ends when `end_listening` is called, and
+        yields nothing if it was called before.
         """
         event = asyncio.Event()
         listener = (asyncio.get_running_loop(), event)
@@ -512,9 +515,11 @@ class CellService:
 
         While the queue is empty, the engine does its other work (`DataEngine.poll`): it retrains if
         that is due, puts a trained version in force step by step, and calls `on_safe_mode`, a
-        function that it was made with, if a safe mode began or ended. After a finished retrain each
-        of `observers` is called with its report, and every iteration over `changes`, by which
-        clients hear of changes, goes on. An error in this work is logged and not raised.
+        function that it was made with, if a safe mode, in which parts are verified, began or ended.
+        If this gives a report, of a retrain or of a version that a rollback, a release or a new
+        policy made, each of `observers` is called with it; then every iteration over `changes`, by
+        which clients hear of changes, goes on. An error in this work, or of an observer, is logged
+        and not raised.
         """
         # The time right after a response is best for other work: the next part is farthest away.
         timeout = SHORT_WAIT

@@ -57,7 +57,7 @@ def backup_store(url: FilePath, out: FilePath) -> BackupReport:
     is in the copy. Damaged records of a journal are left out, and a record that contradicts the
     copy, or that its database refuses, becomes an event of kind "dead letter" there, which is also
     logged. The copy is written in full or not at all; it is not in WAL mode. The store and the
-    journals are only read, but a store that is not in WAL mode is set to it.
+    journals are only read, but a store that is not in WAL mode is set to it if it can be written.
 
     Parameters
     ----------
@@ -142,8 +142,9 @@ def restore_store(copy: FilePath, store: FilePath) -> tuple[CellHistory, ...]:
     Returns
     -------
     tuple of CellHistory
-        For each cell of `copy`: its numbers of rows and of ledger entries, and the digest of its
-        newest entry.
+        For each cell what `verify_history` found in `copy`: its numbers of rows and of ledger
+        entries, the digest of its newest entry, and the number of records in its journal beside
+        `copy`, which are not among the rows.
 
     Raises
     ------
@@ -153,6 +154,8 @@ def restore_store(copy: FilePath, store: FilePath) -> tuple[CellHistory, ...]:
         `backup_store`. If a journal cannot be made: the store has been copied by then, and stays.
     OutputError
         If `store` or its `-wal` file exists, or it cannot be written, for example on a full disk.
+    OSError
+        If the disk fails while `backup_store` reads the records of a journal.
     """
     report = verify_history(os.fspath(copy))
     if not report.ok:
@@ -171,7 +174,7 @@ def restore_store(copy: FilePath, store: FilePath) -> tuple[CellHistory, ...]:
 
 
 def _add_records(file: Path, cell: str, records: list[Record]) -> None:
-    """Commit records of a cell's journal to `file`, the copy; it is not opened for no records.
+    """Commit records of a cell's journal to `file`, the copy; without records do not open it.
 
     Records that the copy already has change nothing. A record that contradicts the copy, or that
     its database refuses, is stored there as an event of kind "dead letter", and logged. Raise

@@ -62,9 +62,10 @@ def make_engine(url: str | None) -> sa.Engine:
     Raises
     ------
     StoreError
-        For any other database, for a URL that cannot be read, has a NUL or is not UTF-8, for a
-        SQLite database in memory, for a file whose name begins with `file:`, which SQLite takes for
-        a URI, and if the driver of PostgreSQL is not installed. The message has no password.
+        For any other database, for a URL that cannot be read, has a NUL or is not UTF-8, for a URL
+        or the name `:memory:` of SQLite in memory, for a file whose name begins with `file:`, which
+        SQLite takes for a URI, and if the driver of PostgreSQL is not installed. The message has no
+        password.
     """
     if url is None:
         arguments = {"check_same_thread": False}
@@ -215,8 +216,9 @@ def reading(url: str) -> Iterator[sa.Connection]:
     """Context manager that opens a store for reading; the block sees one snapshot of the database.
 
     No store is created and no row is changed, and the connection is closed after the block; but the
-    file of a store that was not in WAL mode is set to it. In SQLite, text with damaged bytes is
-    read with escapes instead of an error.
+    file of a store that was not in WAL mode is set to it, and a file of 0 bytes, which is refused,
+    becomes an SQLite database without tables. In SQLite, text with damaged bytes is read with
+    escapes instead of an error.
 
     Parameters
     ----------
@@ -345,12 +347,12 @@ class Database:
         """Create the tables or check them, add the cell to them if it is new, set `newest_entry`.
 
         Columns that an older store lacks are added. `newest_entry` becomes number and digest of the
-        cell's newest ledger entry. A new cell gets `product`, and its ledger begins with the key in
-        the file that DENGINE_LEDGER_KEY names. Return the cell with its product; it has none if
-        neither the store nor `product` names one. Raise StoreError, and disconnect, if the database
-        cannot be opened or is no store of this schema, if the ledger of the cell was begun with
-        another key, and if `join_product` refuses the product, for example for a cell that has
-        another one.
+        cell's newest entry in its ledger, a hash chain. A new cell gets `product`, and its ledger
+        begins with the key in the file that DENGINE_LEDGER_KEY names, or without a key if it names
+        none or the store is in memory. Return the cell with its product; it has none if neither the
+        store nor `product` names one. Raise StoreError, and disconnect, if the database cannot be
+        opened or is no store of this schema, if the ledger of the cell was begun with another key,
+        and if `join_product` refuses the product, for example for a cell that has another one.
         """
         try:
             with _store_errors("open", self.name), self._engine.connect() as plain:
@@ -384,16 +386,17 @@ class Database:
     def _transaction(self) -> Iterator[sa.Connection]:
         """Context manager that opens a write transaction, locks the cell and gives the connection.
 
-        After the block a ledger entry for the rows that it added is inserted, and both are
-        committed. Then `newest_entry` becomes number and digest of this entry, and `on_entry`, a
-        function that the outbox has set, is called. If the block added no rows and changed no
-        settings, there is no entry. On an error everything is rolled back. Errors of the database,
-        and OSError, ValueError, TypeError and OverflowError, become StoreError; dengine's own
-        errors and all others pass unchanged.
+        After the block an entry for the rows that it added is inserted into the ledger, the cell's
+        hash chain, and both are committed. Then `newest_entry` becomes number and digest of this
+        entry, and `on_entry`, a function that the outbox has set, is called. If the block added no
+        rows and changed no settings, there is no entry. On an error everything is rolled back.
+        Errors of the database, and OSError, ValueError, TypeError and OverflowError, become
+        StoreError; dengine's own errors and all others pass unchanged.
 
         StoreError is raised, too, if the function given to `commit_if` returns False, and if the
         SQLite file was replaced. If this is noticed only after the commit, the rows are in the
-        file that was replaced. The lock keeps other transactions from writing rows of the cell
+        file that was replaced; and if the connection to a server broke during the commit, the
+        server may have the rows. The lock keeps other transactions from writing rows of the cell
         until this one ends; SQLite locks the whole file.
         """
         with _store_errors("write to", self.name), self._writer.connect() as connection:
@@ -444,8 +447,9 @@ class Database:
     def has_entry(self, number: int, digest: str) -> bool:
         """Return whether the cell's ledger has an entry with this number and hexadecimal digest.
 
-        The records that wait in the outbox are written first, if the database takes them in time.
-        Raise StoreError if the database fails.
+        The ledger is a hash chain. The records that wait in the outbox are written first, if the
+        database takes them in time. Raise StoreError if the database fails, is closed or was opened
+        before a fork.
         """
         rows = self.read(
             sa.select(LEDGER.c.digest).where(self.own(LEDGER), LEDGER.c.number == number)
@@ -453,14 +457,14 @@ class Database:
         return [row.digest.hex() for row in rows] == [digest]
 
     def check_integrity(self, window: int, since: int | None = None) -> str:
-        """Compare the rows that an engine reads with the ledgers of their cells.
+        """Compare the rows that an engine reads with the ledgers (hash chains) of their cells.
 
         These are the settings, corrections, labels and model versions of this cell, and of the
         other cells of its product. Of the labels only the newest are checked. The rest is checked
-        in full, except for the arrays of the versions; of each ledger itself only the newest entry.
-        A ledger with another key than the one with which the store was opened counts as a
-        difference, too. The records that wait in the outbox are written first, if the database
-        takes them in time.
+        in full, except for the arrays of the versions and the settings that the store itself keeps
+        (`RESERVED`); of each ledger itself only the newest entry. A ledger with another key than
+        the one with which the store was opened counts as a difference, too. The records that wait
+        in the outbox are written first, if the database takes them in time.
 
         Parameters
         ----------
@@ -602,6 +606,7 @@ class Database:
         self.check_open()
         self.before_use()  # before the lock is taken: it may write
         with self._writing:
+            self.check_open()  # again, since a `close` may have come first
             try:
                 with self._transaction() as connection:
                     return add_rows(connection)

@@ -123,6 +123,11 @@ class CorrectionTable(CellTable):
         list of Correction
             Of the cell, or of all cells of its product; each with the number of the label, as
             `seq`.
+
+        Raises
+        ------
+        StoreError
+            For a stored value that cannot be read, and if the database fails.
         """
         query = (
             sa.select(*CORRECTION.c, LABEL.c.seq)

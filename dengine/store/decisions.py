@@ -29,7 +29,8 @@ from .views import LABELS, DecisionGroup, HistoryFilter, Stretch, Tally
 class DecisionTable(CellTable):
     """Reads the decisions of a cell, with their labels after corrections.
 
-    It takes what `CellTable` takes.
+    It takes what `CellTable` takes. Every method raises StoreError if the database fails; `get`,
+    `select`, `pending`, `tally` and `counts` also for a stored value that cannot be read.
     """
 
     def get(self, decision_id: str, trace: bool = True) -> StoredDecision | None:
@@ -112,7 +113,7 @@ class DecisionTable(CellTable):
         Raises
         ------
         StoreError
-            For a stored value that cannot be read.
+            For a stored value that cannot be read, and if the database fails.
         """
         conditions = [
             column == str(value)
@@ -207,9 +208,9 @@ class DecisionTable(CellTable):
 
         Decisions are numbered 1, 2, ... in each cell. A check is overdue if its decision has this
         or a lower number, asked for the check, and has no label. The number returned is the larger
-        of two: the number of the newest decision minus `within`, and the largest `overdue_to` of a
-        stored label, the number of the newest decision whose check was overdue when the rule was
-        updated with this label. It is 0 if nothing can be overdue yet.
+        of two: the number of the newest decision minus `within`, and the largest `overdue_to` that
+        is stored with a label, which is this number at the time when the rule was updated with the
+        label. It is 0 if nothing can be overdue yet.
 
         Parameters
         ----------
@@ -263,7 +264,7 @@ class DecisionTable(CellTable):
         Raises
         ------
         StoreError
-            For a stored value that cannot be read.
+            For a stored value that cannot be read, and if the database fails.
         """
         newest = n_decisions(self._database.cell_id)
         aged = (sa.false() if within is None else newest - DECISION.c.number >= within).label(
@@ -295,7 +296,7 @@ class DecisionTable(CellTable):
         )
 
     def stretches(self, n: int = 1, seconds: float = 0.0, start: float = 0.0) -> list[Stretch]:
-        """Count the cell's decisions in at most `n` stretches of equal length, oldest first.
+        """Count the cell's decisions in stretches of equal length, oldest first.
 
         A stretch is a run of consecutive decisions, or a period of time. The newest stretch may be
         shorter. A period of time without decisions has no stretch.

@@ -89,8 +89,9 @@ class Drainer:
         """Why the store cannot be written or read at present; "" if it can.
 
         The first of these is given: why the journal cannot be written; the last error of the
-        database, until a later attempt succeeds; that the oldest record has waited for the database
-        longer than `limit` (the seconds that a call waits at most) and than LAG_SECONDS (1 s).
+        copying to the database or timeout of `drain`, until the copying succeeds again; that the
+        oldest record has waited for the database longer than `limit` (the seconds that a call waits
+        at most) and than LAG_SECONDS (1 s).
         """
         fault = self._recorder.fault or self._error
         lag = self.lag
@@ -140,10 +141,11 @@ class Drainer:
         """Return (decision id, label number) of each label that was drained since the last call.
 
         To drain a label is to copy it from the journal to the database. The pairs are in the order
-        in which this was done. A report that repeats a stored label has the number of that label,
-        and a late stop that of the label that it corrects. A label that became a dead letter has no
-        pair, nor has one that an earlier process left in the journal. Without a product the list is
-        empty.
+        in which this was done. A report that repeats a stored label has the number of that label. A
+        late stop (a line stop of a part that was confirmed as good before) has the number of the
+        label that it corrects. There is no pair for a dead letter (a label that the database did
+        not take, and that became an event), or for a label that an earlier process left in the
+        journal. Without a product (cells that share labels and versions) the list is empty.
         """
         with self._changed:
             numbers = self._label_numbers
@@ -207,7 +209,8 @@ class Drainer:
         """End the thread, wait for it, and return whether it ended within these seconds.
 
         Before it ends, the thread copies the records that are on the journal's disk to the
-        database, unless the database fails, and makes the calls that were submitted.
+        database, unless the database fails, and makes the calls that were submitted. If it does
+        not end in time, it goes on. It must have been started.
         """
         with self._changed:
             self._stopped = True
@@ -231,10 +234,10 @@ class Drainer:
 
         The thread runs this until `stop` is called. Before a call all of these records are copied;
         if this fails, the call is made nevertheless. Any error of the copying is kept for `fault`,
-        until it succeeds again. It is logged only if none is kept there yet, and no timeout of
-        `drain`. The database is tried again a second later, or sooner if there is a call.
-        Once stopped, it ends when all submitted calls are made, and the records are copied or the
-        copying has failed.
+        until it succeeds again. It is logged only if neither an earlier error nor a timeout of
+        `drain` is kept there. The database is tried again about a second later, or sooner if there
+        is a call. Once stopped, the thread ends when all submitted calls are made, and the records
+        are copied or the copying has failed.
         """
         while True:
             call = self._wait_for_work()
@@ -273,9 +276,9 @@ class Drainer:
             return self._calls.popleft() if self._calls else None
 
     def _note_error(self, error: Exception) -> None:
-        """Keep an error of the database for `fault`, and wake those who wait.
+        """Keep an error of the copying to the database for `fault`, and wake those who wait.
 
-        It is logged only if the database has answered since the last one.
+        It is logged only if neither an earlier error nor a timeout of `drain` is kept there.
         """
         with self._changed:
             if not self._error:
@@ -288,10 +291,10 @@ class Drainer:
 
         They go in chunks of at most CHUNK (500) records, see `_drain_chunk`. A decision that a
         later record replaces is left out. Later records go with them only if they still fit into
-        the last chunk. The journal's head, the small file beside it, is synced first. At the end,
-        or at once if there are no records, the last error, which `fault` shows, is cleared. Raise
-        StoreError if the database fails: chunks that were committed stay, and the last error is
-        kept.
+        the last chunk. The journal's head, the small file beside it, is synced first; a failure of
+        that is ignored. At the end, or at once if there are no records, the last error, which
+        `fault` shows, is cleared. Raise StoreError if the database fails: chunks that were
+        committed stay, and the last error is kept.
         """
         synced_to = self._recorder.n_synced
         if self.n_drained < synced_to:

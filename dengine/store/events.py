@@ -90,7 +90,7 @@ class EventTable(CellTable):
         Raises
         ------
         StoreError
-            For a stored value that cannot be read.
+            For a stored value that cannot be read, and if the database fails.
         """
         query = (
             sa.select(EVENT).where(self._own(EVENT)).order_by(EVENT.c.number.desc()).limit(limit)

@@ -49,13 +49,14 @@ class RecordInsertion:
         A record that is stored already changes nothing, except that a label has its pair. A record
         that contradicts the store, like another label of a labelled decision, or a label whose
         decision is not stored, becomes a dead letter: an event that names it and says why (its
-        trace and other values are not in it), and that is logged. A late stop (`_is_late_stop`)
-        corrects the label of its part to failure, with an event, and has its pair. A late stop of a
-        label that was forgotten is a dead letter; if the label counts as a failure already, the
-        late stop changes nothing. A label of a quarantined trace is quarantined. If the database
-        refuses a value, the records are halved, each half in a transaction of its own, until the
-        refused record is alone; it becomes a dead letter, too. A label that became a dead letter
-        has no pair. Raise StoreError if the database fails in another way; halves that were
+        trace and other values are not in it), and that is logged. A late stop, which is a line stop
+        of a part that had counted as good, corrects the label of its part to failure, with an
+        event, and has its pair. A late stop of a forgotten label, which a person has taken out of
+        use, is a dead letter; if the label counts as a failure already, the late stop changes
+        nothing. A label of a quarantined trace is quarantined (kept out of training). If the
+        database refuses a value, the records are halved, each half in a transaction of its own,
+        until the refused record is alone; it becomes a dead letter, too. A label that became a dead
+        letter has no pair. Raise StoreError if the database fails in another way; halves that were
         committed before stay.
         """
         try:
@@ -78,12 +79,12 @@ class RecordInsertion:
         not stored, becomes an event, "dead letter", which is also logged as an error. No two
         decisions among the records may have one id. A line stop of a part that had counted as good
         (`_is_late_stop`) corrects the label of that part, with an event, unless it is a failure
-        already; if the label was forgotten, the line stop becomes a dead letter. Return one pair
-        (decision id, number) for each decision that has a label among the records, unless that
-        becomes a dead letter: the number of its first label, whether that is new, was stored
-        before, or is corrected by a late stop. A new label keeps its number if all stored numbers
-        are smaller, and otherwise gets the next one (`Database.insert`). It is quarantined (kept
-        out of training) if its decision is.
+        already; if a person has taken the label out of use (forgotten), the line stop becomes a
+        dead letter. Return one pair (decision id, number) for each decision that has a label among
+        the records, unless that becomes a dead letter: the number of its first label, whether that
+        is new, was stored before, or is corrected by a late stop. A new label keeps its number if
+        all stored numbers are smaller, and otherwise gets the next one (`Database.insert`). It is
+        quarantined (kept out of training) if its decision is.
         """
         events = [record for record in records if isinstance(record, Event)]
         decisions = [record for record in records if isinstance(record, StoredDecision)]
@@ -156,8 +157,8 @@ class RecordInsertion:
     ) -> None:
         """Insert events, and one "dead letter" for each problem, which is also logged as an error.
 
-        An event is left out if the cell has one with the same time, kind and text; a "dead letter",
-        which has the present time, is not. Nothing is committed.
+        An event is left out if the cell has stored one with the same time, kind and text. A "dead
+        letter" gets the present time and is always inserted. Nothing is committed.
         """
         new = []
         if events:

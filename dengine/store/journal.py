@@ -90,8 +90,8 @@ def encode_record(record: Record) -> bytes:
 def decode_record(blob: bytes) -> Record:
     """Return the record that `encode_record` wrote; raise StoreError for bytes that have no record.
 
-    A decision has number 0 and no label. A changed number or sample is not noticed here; the
-    journal checks for that.
+    A decision has number 0 and no label. Bytes that were changed and can still be decoded are not
+    noticed here; the journal compares their CRC-32.
     """
     with instead(
         StoreError,
@@ -427,10 +427,10 @@ class Journal:
         """Read the header and all records that the store lacks; set the journal's attributes.
 
         The records are compared with `head`, which was read before. With a damaged header the store
-        counts as lacking every record, and `head` is not compared. Records that are damaged or
-        missing are described in `loss`, and not raised. An unfinished record at the end is left
-        out. Nothing is written. Raise StoreError if the file is no journal, and OSError if it
-        cannot be read. An empty file is a journal without records.
+        counts as lacking every record, and `head` is not compared. A damaged header, and records
+        that are damaged or missing, are described in `loss`, and not raised. An unfinished record
+        at the end is left out. Nothing is written. Raise StoreError if the file is no journal, and
+        OSError if it cannot be read. An empty file is a journal without records.
         """
         head = self.head
         fields: dict[str, Any] = {"newest": None, "n_drained": head.n_drained}
@@ -621,8 +621,9 @@ def _unpack_fields(content: bytes) -> dict[str, Any]:
     """Return the fields of a header or head, by name; raise one of DAMAGES if it is damaged.
 
     DAMAGES are ValueError, LookupError, TypeError and AttributeError. The field "newest", which
-    names the newest ledger entry, becomes a pair (number, digest) or None. The CRC-32 is compared
-    only if there is one: headers of earlier releases have none.
+    names the newest ledger entry, becomes a pair (number, digest) or None; a list in place of the
+    fields is taken for this field alone. The CRC-32 is compared only if there is one: headers of
+    earlier releases have none.
     """
     fields = json.loads(content.rstrip(b"\0 "))
     if isinstance(fields, list):

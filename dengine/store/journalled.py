@@ -87,11 +87,12 @@ class JournalledStore(Outbox):
     def _compare_with_ledger(self) -> None:
         """Check that the store's ledger has the entries that the journal and its head name.
 
-        The head is a small file beside the journal. If an entry is missing, the store was cut off
-        or restored from an older copy: an event DATA_LOST (an alarm) is stored, and all records of
-        the journal will be copied to the database again. Otherwise an event that is no alarm is
-        stored if the journal or its head is new or damaged though the store is not new. Either is
-        logged as an error. Raise StoreError only if the database cannot be read or written.
+        The ledger is the store's hash chain, and the head a small file beside the journal. If an
+        entry is missing, the store was cut off or restored from an older copy: an event DATA_LOST
+        (an alarm) is stored, and all records of the journal will be copied to the database again.
+        Otherwise an event that is no alarm is stored if the journal or its head is new or damaged
+        though the store is not new. Either is logged as an error. Raise StoreError only if the
+        database cannot be read or written.
         """
         journal = self._journal
         database = self.store.database
@@ -115,10 +116,11 @@ class JournalledStore(Outbox):
         """Copy to the database what an earlier process left in the journal, and clear the journal.
 
         If records are damaged or missing in the journal, an event DATA_LOST is stored, which is an
-        alarm until a person acknowledges it, and an error is logged. Raise StoreError if the
-        database fails, or another release wrote a record, and OSError if the journal cannot be
-        read; the records that were not copied then stay in the journal. Raise StoreError, too, if
-        the journal cannot be cleared.
+        alarm until a person acknowledges it, and an error is logged. A record that the store
+        refuses becomes an event, "dead letter", and an error is logged, too. Raise StoreError if
+        the database fails, or a record cannot be decoded, for example that of another release, and
+        OSError if the journal cannot be read; the records that were not copied then stay in the
+        journal. Raise StoreError, too, if the journal cannot be cleared.
         """
         since = ""
         for item in self.store.decisions.select(HistoryFilter(), limit=1):
@@ -131,11 +133,12 @@ class JournalledStore(Outbox):
         self._journal.clear()
 
     def _begin_check(self) -> None:
-        """Compare the store with its ledger; put a difference into `integrity_error`, and log it.
+        """Compare what the engine reads from the store with its ledger, and log a difference.
 
-        While there is an `integrity_error`, every part is verified. SQLite's own check of the file,
-        without the tables of traces and events, runs in a thread; if it fails, its error counts as
-        a difference. It is waited for only CHECK_SECONDS (0.1 s); later it may still set
+        The ledger is the store's hash chain. The first difference is put into `integrity_error`,
+        and while this is set, every part is verified. SQLite's own check of the file, without the
+        tables of traces and events, runs in a thread; if it fails, its error counts as a
+        difference. It is waited for only CHECK_SECONDS (0.1 s); later it may still set
         `integrity_error`. Raise StoreError if the database cannot be read.
         """
         check = threading.Thread(
@@ -290,9 +293,9 @@ class JournalledStore(Outbox):
         """Return the decision that an id already has, or None for a new id.
 
         The decision has its label if the label is on disk. Raise StoreError if the id cannot be
-        looked up in time, or its stored trace is damaged. After such an error `find_decision`
-        raises StoreError for this id too, until a decision is recorded for it or this method is
-        called again without an error.
+        looked up, or its stored trace is damaged. After such an error `find_decision` raises
+        StoreError for this id too, until a decision is recorded for it or this method is called
+        again without an error.
         """
         with self._changed:
             self._unrecorded.discard(decision_id)
@@ -369,12 +372,12 @@ class JournalledStore(Outbox):
     def close(self) -> None:
         """Copy the records to the database, end the threads, close store and journal.
 
-        This ends within seconds, unless the outbox is `patient`, so that it waits for the disk and
-        the database without a time limit. Records that the database does not take stay in the
-        journal, which is logged, and the next engine copies them. Records that the disk does not
-        take are given up, and an error is logged; no call has said that they are on disk. If the
-        disk hangs, store and journal stay open, and the cell is owned until the process ends. A
-        second call does nothing, nor does one in a forked process.
+        This ends within seconds; but a `patient` outbox first waits without a time limit for the
+        disk and the database, unless they fail. Records that the database does not take stay in
+        the journal, which is logged, and the next engine copies them. Records that the disk does
+        not take are given up, and an error is logged; no call has said that they are on disk. If
+        the disk hangs, store and journal stay open, and the cell is owned until the process ends. A
+        second call does nothing, nor does a call in a forked process.
         """
         if not self.is_usable:
             return

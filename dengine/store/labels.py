@@ -71,16 +71,17 @@ class LabelTable(CellTable):
     ) -> LabelledTraces:
         """Return labelled traces for training, with corrected labels, oldest first.
 
-        Labels that a person had forgotten are left out, and so are labels of quarantined traces,
-        which are stored but never used in training. A trace that is missing or not as it was stored
-        is left out, too, and an event with the ids of such decisions (of eight at most, and the
-        number of the others) is written to the store, unless it has this event already, or logged
-        if the store cannot be written.
+        Forgotten labels, which a person has taken out of use, are left out, and so are labels of
+        quarantined traces, which are stored but never used in training. A trace that is missing or
+        not as it was stored is left out, too, and an event with the ids of such decisions (of eight
+        at most, and the number of the others) is written to the store, unless it has this event
+        already, or logged if the store cannot be written.
 
         Parameters
         ----------
         limit : int or None
-            Number of newest labels that are read; those whose trace is damaged count. None: all.
+            Number of newest labels that are read. Labels whose trace is damaged count; forgotten
+            labels and labels of quarantined traces do not. None: all.
         first, last : int, optional
             Numbers of the first and the last label, both included.
         corrected_to : int or None
@@ -143,11 +144,12 @@ class LabelTable(CellTable):
     ) -> Iterable[Any]:
         """Run a query for the newest `limit` labels up to number `last`; return rows, newest first.
 
-        `query` must have this limit (None: no limit), order and condition already. In a product it
-        is first run on the labels with the 2 * `limit` highest numbers up to `last`, because the
-        database would sort all labels of the product otherwise. If these give fewer than `limit`
-        rows, it is run on all labels. Rows of all labels are fetched while the caller goes through
-        them, so that must happen within the transaction of `connection`.
+        `query` must have this limit (None: no limit), order and condition already. In a product a
+        query with a limit is first run on the labels with the 2 * `limit` highest numbers up to
+        `last`, because the database would sort all labels of the product otherwise. If these give
+        fewer than `limit` rows, and in every other case, the query is run on all labels. Its rows
+        are then fetched while the caller goes through them, which the caller must do within the
+        transaction of `connection`.
         """
         if self._scope.product is not None and limit is not None:
             newest = self._scope.newest(connection, LABEL.c.seq)
@@ -203,13 +205,14 @@ class LabelTable(CellTable):
     def outcomes_since(
         self, seq: int, since_version: int = 0, overdue_to: int = 0
     ) -> list[OutcomeRecord]:
-        """Return the outcomes with which a rule is updated, with corrected labels, oldest first.
+        """Return the outcomes that update a decision rule, with corrected labels, oldest first.
 
-        Left out are forgotten labels, labels of quarantined traces (stored, but never used in
-        training), and labels of rejected parts (`Source.INSPECTION`), because somebody chooses
-        which of these parts come back. Only this cell's labels count: labels of other cells are no
-        evidence for this one, and a drift detector that counts them would notice too late that this
-        cell has changed. Whether labels and decisions are as they were stored is not checked here.
+        Left out are forgotten labels, labels without their decision, labels of quarantined traces
+        (stored, but never used in training), and labels of rejected parts (`Source.INSPECTION`),
+        because somebody chooses which of these parts come back. Only this cell's labels count:
+        labels of other cells are no evidence for this one, and a drift detector that counts them
+        would notice too late that this cell has changed. Whether labels and decisions are as they
+        were stored is not checked here.
 
         Parameters
         ----------
@@ -218,12 +221,14 @@ class LabelTable(CellTable):
         since_version : int, default 0
             Only of decisions by this version or a later one.
         overdue_to : int, default 0
-            Up to this decision number a check without a label is overdue, and its decision counts
-            as wrong until its label comes; 0: none is. All overdue checks are included, whatever
-            `seq` is: each adds an outcome "failure" if the lower bound of its decision is above 0,
-            and an outcome "success" if the upper bound is below 1 (`overdue_outcomes`). These
-            outcomes stand where the running engine updated the rule with them: before the first
-            returned label that came when this check was overdue already, else at the end.
+            Up to this decision number a check (action VERIFY) without a label is overdue, and its
+            decision counts as wrong until its label comes; 0: none is. Overdue checks are included
+            whatever `seq` is, but not those of quarantined traces. Each adds an outcome "failure"
+            if the lower bound of its decision is above 0, and an outcome "success" if the upper
+            bound is below 1 (`overdue_outcomes`). These outcomes stand where the running engine
+            updated the rule with them: before the first returned label that came when this check
+            was overdue already, else at the end. A label that does not record what was overdue
+            stands behind all overdue checks up to its own decision.
 
         Returns
         -------
@@ -270,8 +275,8 @@ class LabelTable(CellTable):
         """Return how many accepted parts before the cell's newest label had no report.
 
         Each label stores, as `silent`, the number of such parts since the label before it. The sum
-        over the cell's labels is returned; labels of quarantined traces (stored, but never used in
-        training) are left out.
+        over the cell's labels, forgotten ones included, is returned; labels of quarantined traces
+        (stored, but never used in training) are left out.
 
         Parameters
         ----------

@@ -364,8 +364,9 @@ def find_integrity_error(connection: sa.Connection, cell_id: str, key: bytes, fi
     key : bytes
         Key of the ledger, b"" without one. Another key than the ledger's is a difference.
     first : int
-        Number of the oldest label that is checked. Settings, corrections and versions are checked
-        in full, but for the versions' stored states.
+        Number of the first label that is checked; earlier labels that belong to the same ledger
+        entry are checked, too. Settings, corrections and versions are checked in full, but for the
+        versions' stored states.
 
     Returns
     -------

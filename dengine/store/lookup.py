@@ -18,8 +18,9 @@ N_RECENT = 1_000  # newest decisions kept in memory
 class DecisionIndex:
     """Finds decisions and labels by id in memory, without the database.
 
-    It holds the newest decisions, every record that is not drained, and the hashes of all ids,
-    which tell ids that are certainly new. A million hashes take about 70 MB of memory.
+    It holds the newest decisions, every record that is not drained (copied to the database), and
+    the hashes of all ids, which tell ids that are certainly new. A million hashes take about 70 MB
+    of memory.
 
     It has no lock: whoever shares it between threads holds one.
 
@@ -45,7 +46,8 @@ class DecisionIndex:
         `entry` holds the record. It replaces an earlier decision of that id, or an earlier label of
         that decision. A decision enters `recent`, and the oldest leaves it if there are then more
         than N_RECENT (1,000). A decision that replaces one in `recent` keeps its place in the
-        order, and any other is the newest. `find` finds one that left until it is drained.
+        order, and any other is the newest. `find` finds a decision that left `recent` until the
+        database has it.
         """
         record = entry.record
         if isinstance(record, StoredDecision):
@@ -74,8 +76,9 @@ class DecisionIndex:
 
         `entry` holds the record. The newest N_RECENT decisions (1,000) stay in `recent`. If the
         record is a label, its decision there is replaced by a copy with the label, without the
-        label's number and time. An event changes nothing, nor does a decision if another with the
-        same id was added after it. Raise KeyError for a label if none of its decision waits.
+        label's number and time; a later label of the decision is not removed. An event changes
+        nothing, nor does a decision if another with the same id was added after it. Raise KeyError
+        for a label if no label of its decision waits for the database.
         """
         record = entry.record
         if isinstance(record, StoredDecision) and not self.is_replaced(entry):

@@ -40,8 +40,9 @@ def open_store(
     ----------
     store : None, str, path or SqlStore
         None: a store in memory. A file or URL: a database; a `CellAddress`, a text that `address`
-        returns, also names the cell and its product, otherwise the cell is "cell". A file is
-        created if need be, but not its folder. An open store is returned unchanged.
+        returns, also names the cell and its product (what the cell makes), otherwise the cell is
+        "cell". A file is created if need be, but not its folder. An open store is returned
+        unchanged.
     must_exist : bool, default False
         Raise a StoreError for a file or cell that does not exist, instead of creating it. Without
         effect on None and on an open store.
@@ -57,11 +58,12 @@ def open_store(
     Raises
     ------
     StoreError
-        For an argument of another type, a database that cannot be used or is another program's, a
-        ledger with another key than the one in the file that DENGINE_LEDGER_KEY names, if that file
-        cannot be read or holds fewer than 16 bytes, a cell of another product, a product whose name
-        is blank or not printable, or for a cell that has worked without one, and a time limit that
-        is not above 0 or not finite (that of the environment also for a store in memory).
+        For an argument of another type, and for a database that cannot be used or is another
+        program's. For a ledger (the cell's hash chain) with another key than the one in the file
+        that DENGINE_LEDGER_KEY names, and if that file cannot be read or holds fewer than 16 bytes.
+        For a cell of another product, a product whose name is blank or not printable, and a product
+        for a cell that has worked without one. For a time limit that is not above 0 or not finite
+        (that of the environment also for a store in memory).
     """
     from .peers import check_cell_exists  # SQLAlchemy is imported where it is used
     from .sql import SqlStore

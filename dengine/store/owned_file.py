@@ -23,8 +23,8 @@ def _lock_of_system() -> Callable[[int], object]:
 
     The function does not wait: it raises BlockingIOError if another descriptor has the lock, and
     otherwise the OSError of the system, for example if the file system has no locks. The lock ends
-    when the file is closed or the process ends. It is that of `flock`. On Windows one byte far
-    behind the content is locked, and the function moves the offset of the file there.
+    when the file is closed or the process ends. It is an exclusive lock by `flock`. On Windows one
+    byte far behind the content is locked, and the function moves the offset of the file there.
     """
     try:
         import fcntl
@@ -120,7 +120,8 @@ class OwnedFile:
     def in_place(self) -> bool:
         """Return whether this open file is still the one at its path; on Windows always True.
 
-        Raise OSError if the system refuses to look, except that there is no file, which is False.
+        It is False if there is no file at the path. Raise OSError if the system refuses to look, or
+        this file is closed.
         """
         if os.name == "nt":  # there an open file cannot be deleted, moved or replaced
             return True
@@ -144,7 +145,8 @@ class OwnedFile:
     def write(self, content: bytes | bytearray, offset: int) -> None:
         """Write all of the content at an offset in bytes; nothing is synced.
 
-        Raise OSError if the system refuses, or a full disk takes only a part.
+        Raise OSError if the file is closed, the system refuses, or a full disk takes only a part,
+        which stays in the file.
         """
         if hasattr(os, "pwrite"):
             written = os.pwrite(self._fd, content, offset)

@@ -51,11 +51,11 @@ def check_peer_settings(
 ) -> None:
     """Check that two cells of a product would embed a trace in the same way.
 
-    Compared are the settings on which the arrays of a version depend: the reducer with its
-    parameters, folds, training window, novelty, seed, `TraceSpec`, and the name and description of
-    an object that a user passed as reducer or model. The policy and the rest of the `Recipe`, like
-    the radius and the time budget of a retrain, may differ. Nothing is compared if one of the cells
-    has no recipe yet. The `TraceSpec` is compared only if both cells have one.
+    The settings on which the arrays of a version depend must be equal: `reducer`, `params`,
+    `folds`, `window` and `novelty` of the `Recipe`, the seed, the `TraceSpec`, and the name and
+    description of an object that a user passed as reducer or model. The policy and the rest of the
+    `Recipe`, like the radius and the time budget of a retrain, may differ. Nothing is compared if
+    one of the cells has no recipe yet. The `TraceSpec` is compared only if both cells have one.
 
     Parameters
     ----------
@@ -101,7 +101,7 @@ def _embedding_settings(settings: Mapping[str, str]) -> dict[str, Any]:
 
 
 def check_cell_exists(url: str, cell_id: str) -> None:
-    """Raise a StoreError if a database has no such cell, is not there, or is no store.
+    """Raise a StoreError if a database has no such cell, or cannot be read as a store.
 
     `url` is a file, or a URL of SQLite or PostgreSQL.
     """
@@ -120,8 +120,9 @@ def list_cells(url: str) -> list[CellSummary]:
 
     It has the cell's product, its numbers of decisions and labels, the newest version that was put
     in force in the cell or its product, and the time of the newest decision or label. Forgotten
-    labels and those of quarantined traces count; records that are only in a journal do not. Raise
-    StoreError if the database is not there or is no store. No row is written (see `reading`).
+    labels count, and so do labels of quarantined traces, which are never trained on. Records that a
+    journal holds and the database does not hold yet do not count. Raise StoreError if the database
+    is not there, is no store or cannot be read. No row is written (see `reading`).
     """
     with reading(url) as connection:
         settings = connection.execute(sa.select(SETTING)).all()

@@ -79,10 +79,10 @@ class Scope:
     def next_number(self, connection: sa.Connection, column: sa.Column[Any]) -> int:
         """Return the number of the next row of a table; nobody else gets it before the commit.
 
-        `column` is the table's column of numbers, and `connection` is in a write transaction. The
-        number is one more than the largest so far. Decisions and events are numbered by cell, and
-        the caller has locked the cell. All other rows are numbered by product, if the cell has a
-        product, and this call locks the product.
+        `column` is the table's column of numbers, and `connection` is in a write transaction that
+        has locked the cell. The number is one more than the largest so far. If the cell has a
+        product, decisions and events are numbered by cell, all other rows by product, and for these
+        this call locks the product. Without a product all rows are numbered by cell.
         """
         if self.product is None or column.table in (DECISION, EVENT):
             return Scope(self.cell_id).newest(connection, column) + 1

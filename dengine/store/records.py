@@ -576,7 +576,8 @@ def from_row(record_type: Callable[..., T], row: Mapping[str, Any], **given: Any
     ------
     StoreError
         If the row lacks a field, or a value cannot be converted to the type of its field. Fields of
-        type str, int and float take any value, unchecked, and every field takes None.
+        type str, int and float take any value, unchecked, a field of type bool takes the truth of
+        any value, and every field takes None.
     """
     try:
         values = {
@@ -596,9 +597,10 @@ def from_row(record_type: Callable[..., T], row: Mapping[str, Any], **given: Any
 def _to_column(value: Any, type_: type) -> Any:
     """Return the value of a field for its column: a text, number, JSON text or packed float32.
 
-    None stays None. `type_` is the type of the field. A value of another type is converted to it;
-    ValueError, TypeError or OverflowError is raised if it cannot be. Only an array is not made of
-    another type: AttributeError is raised.
+    None stays None. `type_` is the type of the field. For a tuple or dict any value that JSON can
+    hold is written, whatever its type; for an array AttributeError is raised if the value is none.
+    For any other type the value is converted to it. ValueError, TypeError or OverflowError is
+    raised if a value cannot be converted or written.
     """
     if value is None:
         return None
@@ -704,10 +706,6 @@ def from_npz(blob: bytes, name: str) -> State:
         do=f"restore {name} from a copy",
     ):
         return read_archive(blob, name=f"a version in {name}")[0]
-
-
-class VersionError(StoreError):
-    """A version's state is not kept, or is damaged; the store itself is well."""
 
 
 @dataclass(frozen=True, slots=True)

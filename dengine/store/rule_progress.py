@@ -44,18 +44,22 @@ def read_rule_progress(
     within: int,
     policy_since: int,
 ) -> RuleProgress:
-    """Read from the store how far the rule of a version was updated; nothing is written.
+    """Read from the store how far the decision rule of a version was updated.
+
+    The records that wait in the outbox are written first, if the database takes them in time;
+    nothing else is written. Raises StoreError if the database fails.
 
     Parameters
     ----------
     store : SqlStore
     version : ModelVersion or None
-        The newest version; None before the first.
+        The newest version; None if there is none, or if its model cannot be restored.
     since_version : int
         The rule counts only decisions made by this version or a later one.
     within : int
-        Number of later decisions after which a check without a label is overdue. A check that the
-        version or a stored label counted as overdue stays so, whatever `within` is.
+        Number of later decisions after which a check, which a decision VERIFY asks for, is overdue
+        if it has no label. A check that the version or a stored label counted as overdue stays so,
+        whatever `within` is.
     policy_since : int
         The version with which the present policy came into force. If the newest decision is by an
         earlier version, no further check becomes overdue by `within`.

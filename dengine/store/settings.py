@@ -36,12 +36,14 @@ class SettingTable(CellTable):
         self._database.write(lambda connection: self.replace(connection, settings))
 
     def replace(self, connection: sa.Connection, settings: Mapping[str, str]) -> None:
-        """Replace the engine's settings of the cell in a write transaction; nothing is committed.
+        """Put new settings in the place of all present ones of the cell; nothing is committed.
 
-        `settings` holds texts by name. The settings that the store itself keeps (`RESERVED`) stay;
-        raise StoreError if `settings` has one of them. Raise SettingError if another cell of the
-        product would embed traces differently, or its recipe or the new one cannot be read. The
-        product stays locked until the transaction ends.
+        `connection` must be in a write transaction. `settings` holds texts by name; a present
+        setting that it lacks is deleted. The settings that the store itself keeps (`RESERVED`)
+        stay; raise StoreError if `settings` has one of them. Raise SettingError if another cell of
+        the product would embed traces differently (`check_peer_settings`), or if its recipe or the
+        new one cannot be read. After these errors nothing is changed. A product stays locked
+        (`lock`) until the transaction ends.
         """
         for key in sorted(settings.keys() & set(RESERVED)):
             raise StoreError(

@@ -131,7 +131,8 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         """Claim the cell for this engine, and open its journal; `close` gives both up.
 
         As long as the cell is claimed, no other engine can own it: the journal's file is locked,
-        and on a PostgreSQL server also the cell. A store in memory must not be claimed.
+        and on a PostgreSQL server also the cell. A store in memory must not be claimed, which is
+        not checked.
 
         Returns
         -------
@@ -186,8 +187,8 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         """Disconnect from the database; a store in memory stays open.
 
         It waits until another thread has finished writing. Then reads and writes raise StoreError.
-        If an engine claimed the cell, its journal is closed, too, and another engine can own it. A
-        second call changes nothing.
+        If an engine claimed the cell, its journal is closed, too, with the records that the
+        database lacks, and another engine can own the cell. A second call changes nothing.
         """
         if not self.database.is_in_memory:
             self.database.close()

@@ -141,17 +141,18 @@ def verify_history(
     expect: str | None = None,
     on_rows: Callable[[int], None] | None = None,
 ) -> HistoryReport:
-    """Check every row of a store's history; nothing is written, and engines may run meanwhile.
+    """Check every row of a store's history; no row is changed, and engines may run meanwhile.
 
     What is wrong is returned as faults, not raised: a row or setting that was changed, added or
     removed, a decision without its trace or a trace or label without its decision, a damaged SQLite
     file, damaged or missing records of a journal, a ledger entry that a cell's journal names and
-    the store lacks, lost data that nobody has acknowledged, and an `expect` that no entry of the
-    checked cells has. Of missing entries and of SQLite's findings only the first 20 and 100 are
-    returned. A journal that is missing or cannot be read is no fault: `waiting` of the cell is None
-    then. Of the settings that the store itself keeps (`RESERVED`) a changed product is not noticed.
-    An SQLite file that was not in the mode WAL, a write-ahead log, is set to it. Takes about 40
-    bytes of memory per row.
+    the store lacks, a cell that no engine has opened, lost data that nobody has acknowledged (an
+    event says so), and an `expect` that no entry of the checked cells has. At most 20 missing
+    ledger entries of a cell, and 100 findings of SQLite, are returned. A journal that is missing or
+    cannot be read is no fault: `waiting` of the cell is None then. A change of the setting
+    `product`, by which cells share what they learn, is not noticed. The SQLite file of a store that
+    was not in WAL mode is set to it. Takes 40 bytes of memory per row of all cells, the same again
+    for the rows of the cell at hand, and the memory of its ledger entries.
 
     Parameters
     ----------
@@ -176,9 +177,10 @@ def verify_history(
     ------
     StoreError
         For what is no store of the present schema, for an unknown cell, for an `expect` that is no
-        digest, and for a ledger with another key than the one that DENGINE_LEDGER_KEY names, or if
-        the key's file cannot be read or has fewer than 16 bytes, or the disk fails while a journal
-        is read.
+        digest, and for a ledger with another key than the one that DENGINE_LEDGER_KEY names. If the
+        key's file cannot be read or has fewer than 16 bytes, if the database cannot be reached, or
+        if the disk fails while a journal is read. Also in place of a ValueError, TypeError,
+        OverflowError or OSError that `on_rows` raises.
     """
     expected = "" if expect is None else expect.strip().lower()
     if expect is not None and not re.fullmatch("[0-9a-f]{8,64}", expected):
@@ -219,11 +221,11 @@ def verify_history(
 def _inspect_journal(path: Path) -> tuple[list[EntryName], int | None, str]:
     """Read a journal; nothing is raised if it is missing or damaged.
 
-    Return the ledger entries that it names (number and digest), the number of records that its
-    store has not taken, and in words which records are damaged or missing, "" if none is. If there
-    is no journal, or it cannot be read, the head, a small file beside it, gives the ledger entry
-    (none if it has none), the number is None and the text "". If the disk fails while the records
-    are read, OSError is raised.
+    Return the ledger entries (number and digest) that it and its head, a small file beside it,
+    name, the number of records that its store has not taken, and in words which records are damaged
+    or missing, "" if none is. If there is no journal, or it cannot be read, the only entry is that
+    of the head (none if it has none), the number is None and the text "". If the disk fails while
+    the records are read, OSError is raised.
     """
     with suppress(StoreError):  # it is missing, damaged, or another user's
         records, journal = read_undrained(path)
@@ -351,7 +353,8 @@ class CellCheck:
 
         A row that names no ledger entry is not in the ledger: something beside dengine wrote it. A
         row was changed if its values do not fit its stored sum. The state of a version has a sum of
-        its own, and a fault of its own.
+        its own, and a fault of its own; a state that was deleted is no fault. Raise the error of
+        `_read_raw`.
 
         The sums of every row with an entry, also of a changed one, are kept for `_check_ledger`.
         Each row adds 1 to `rows`. After every 500th row (CHUNK) `on_rows` is called with 500; `run`
@@ -385,7 +388,7 @@ class CellCheck:
         fit its sum is a fault of its own. All rows must be checked first (`_check_rows`). After an
         entry that was changed, only this entry is a fault; the entry behind a missing one is a
         fault, too. Only the first 20 missing entries are yielded; those behind the newest that an
-        entry or a row names cannot be noticed.
+        entry or a row names cannot be noticed. Raise the error of `_read_raw`.
         """
         sums = {}
         for table, packed in self._sums.items():
@@ -424,7 +427,7 @@ class CellCheck:
         The ledger has a copy of the cell's settings, but not of those that the store itself keeps
         (`RESERVED`), so a change of these is no fault here. A damaged or missing copy counts as
         empty. If the setting with the version of the tables is missing (no engine has opened the
-        cell), that is a fault, too.
+        cell), that is a fault, too. Raise SQLAlchemy's DatabaseError if a table cannot be read.
         """
         stored = read_settings(self.connection, self.cell_id)
         is_copy = (LEDGER.c.cell_id == self.cell_id) & LEDGER.c.settings.is_not(None)
@@ -450,10 +453,11 @@ class CellCheck:
             yield self._fault(EVENT.name, event.number, f"says: {event.text} {LOSS_REMEDY}")
 
     def _check_pairs(self, table: sa.Table, required: sa.Table) -> Iterator[HistoryFault]:
-        """Yield a fault for each row of `table` that needs a row in `required` and has none.
+        """Yield a fault for each row of `table` whose decision id is in no row of `required`.
 
-        The row that is needed has the same decision id. The fault names the table `required`. If a
-        table could not be read to its end, nothing is read or yielded.
+        The fault names the table `required`. If an earlier check of the cell ended with a database
+        error, nothing is read or yielded. Raise SQLAlchemy's DatabaseError if a table cannot be
+        read.
         """
         if self._is_unreadable:  # everything that could not be read would be missing
             return

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import sqlalchemy as sa
 
-from ..errors import StoreError, instead
+from ..errors import StoreError, VersionError, instead
 from ..records import Arrays, RetrainReport
 from .cell_table import CellTable
 from .connections import Database
@@ -18,7 +18,6 @@ from .records import (
     ModelVersion,
     Row,
     StoredVersion,
-    VersionError,
     check_state,
     from_npz,
     from_row,
@@ -114,15 +113,16 @@ class VersionTable(CellTable):
         or its product; the product is then locked until the transaction ends. `row["version"]` is
         the number that the caller wants for the version. If the version is not put in force
         (`accepted` of the row is False), it has that number, and nothing else is done. Otherwise it
-        gets the number after the product's newest version if another cell of the product has taken
-        the number wanted, and the states of older versions of cell and product that `keeps_state`
-        does not keep are deleted.
+        gets the number after the newest version of cell and product if the number wanted is taken,
+        and the states of older versions of cell and product that `keeps_state` does not keep are
+        deleted.
         """
         number: int = row["version"]
         if row["accepted"]:
-            if self._scope.product is not None:  # a peer's may have been stored before
+            if self._scope.product is not None:
                 lock(connection, PRODUCT, self._scope.product)
-                number = max(number, self._scope.newest_version(connection) + 1)
+            # A peer's may have been stored before, or one that the engine dropped as too late.
+            number = max(number, self._scope.newest_version(connection) + 1)
             with_state = connection.execute(
                 self._accepted_query().where(VERSION.c.state.is_not(None))
             ).all()
@@ -269,8 +269,9 @@ class VersionTable(CellTable):
     def _accepted_query(self) -> sa.Select[Any]:
         """Return the query for the versions of the cell or its product that were put in force.
 
-        The rows are newest first. The columns are the numbers `retrain` (dropped versions count)
-        and `version`, and `kept`: whether the state is kept.
+        The rows are newest first. The columns are `retrain`, the number among all retrains
+        (those that were dropped are numbered, too), `version`, the number of the version, and
+        `kept`, whether its state is kept.
         """
         return (
             sa.select(*VERSION.c["retrain", "version"], VERSION.c.state.is_not(None).label("kept"))

@@ -118,10 +118,11 @@ class DecisionGroup:
     def label(self) -> str:
         """The corrected label in a word: good, bad, forgotten, overdue or none.
 
+        "forgotten": there is a label, but a correction withdrew it.
         "overdue": a check was asked for, there is no label, and so many decisions followed that the
         check is overdue (`aged`, which is False if the tally was made without `within`). "none":
-        there is no label and the check is not overdue, or none was asked for. A check of a
-        quarantined trace (stored, but never used in training) is never overdue.
+        there is no label, and no check is overdue. A check of a quarantined trace (stored, but
+        never used in training) is never overdue.
         """
         if self.source is not None and self.success is None:
             return "forgotten"
@@ -165,13 +166,13 @@ class Tally:
 
     @property
     def outcomes(self) -> Outcomes:
-        """Counts of accepted, rejected and audited parts by corrected label, for the certificate.
+        """Counts of parts by action and corrected label, for the certificate (an error bound).
 
         An audited part is counted by what the model alone would have done, in the fields of audits
         alone and not among the accepted and rejected parts: `audited_accepts` and `audited_rejects`
-        are those with a label that counts; forgotten and overdue ones have fields of their own, and
-        an audit without a label that is not overdue is in no field. Nor are parts counted as
-        rejected, or as false rejects, that an operator's limits rejected (`Reason.OUTSIDE`).
+        are the audits with the label good or bad. Audits with the label forgotten or overdue have
+        fields of their own, and audits with the label none are in no field. A part that an
+        operator's limits rejected (`Reason.OUTSIDE`) is not counted as rejected or false reject.
         """
         actions = Counter[Action]()
         by_action = Counter[tuple[Action, str]]()

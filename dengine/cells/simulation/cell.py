@@ -139,7 +139,7 @@ def insert_once(
     cycle : int
         Number of the cycle, from 0.
     time_step_s : float
-        Step of the physics in seconds; it must divide 2 ms.
+        Step of the physics in seconds, above 0; it must divide 2 ms.
 
     Returns
     -------
@@ -154,6 +154,8 @@ def insert_once(
     ValueError
         For ranges or probabilities, also of the sensor, that cannot be drawn from, and for a
         negative seed or cycle.
+    OverflowError
+        For a range that is not finite.
     """
     world_rng, sensor_rng, _ = _make_generators(seed, cycle)
     conditions = draw_conditions(parameters, world_rng)
@@ -180,9 +182,9 @@ def _find_cause(conditions: Conditions, pushed: Push) -> str:
     `conditions` are those that were drawn, and `pushed` is what came of them. If a missed grasp or
     a wrong part was drawn, that is the cause. Debris that was drawn is the cause if the part's tip
     stopped below the rim of the hole and its chamfer, at most `SLIP_MM` above the debris. Otherwise
-    the cause is "slip" if the part moved more than `SLIP_MM` in the gripper, and else where its tip
-    stopped: "rim_contact" on the rim or its chamfer, "stuck" at most `STUCK_MM` above the seat
-    (the floor of the hole), "wedging" in between.
+    the cause is "slip" if the part slid up by more than `SLIP_MM` in the gripper, and else where
+    its tip stopped: "rim_contact" on the chamfer, on the rim or above it, "stuck" at most
+    `STUCK_MM` above the seat (the floor of the hole), "wedging" in between.
     """
     tip_mm = pushed.height_mm - conditions.extra_length_mm  # of the part's tip above the seat
     if conditions.fault in ("missed_grasp", "wrong_part"):
@@ -265,8 +267,8 @@ class SimulatedCell:
 
         The force is in newtons, 2 s at 500 Hz. `last` becomes this insertion, and `clock` goes on
         by `cycle_s` seconds, a setting of the cell. Raise DengineError if the last part still waits
-        for verify, proceed or reject, or if MuJoCo is not installed, and SettingError or ValueError
-        for settings that cannot be simulated; nothing changes then.
+        for verify, proceed or reject, or if MuJoCo is not installed, and SettingError, ValueError
+        or OverflowError for settings that cannot be simulated; nothing changes then.
         """
         if self._waiting:
             raise DengineError(

@@ -86,8 +86,9 @@ def save_insertions(
     Parameters
     ----------
     path : str or path
+        No suffix is added; `load_dataset` needs the suffix .npz.
     insertions : sequence of SimulatedInsertion
-        At least one.
+        At least one; ValueError if there is none.
     force : bool, default False
         Replace a file that exists; never a database, a folder or a link.
 

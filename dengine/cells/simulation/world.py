@@ -71,8 +71,8 @@ def push(conditions: Conditions, time_step_s: float = TIME_STEP_S) -> Push:
     DengineError
         If MuJoCo is not installed.
     SettingError
-        For a step that does not divide 2 ms (within a relative error of 1e-9), and for sizes that
-        MuJoCo refuses.
+        For a step that does not divide 2 ms (within a relative error of 1e-9), and for sizes,
+        masses and stiffnesses that MuJoCo refuses.
     """
     with instead(
         DengineError,
@@ -81,7 +81,7 @@ def push(conditions: Conditions, time_step_s: float = TIME_STEP_S) -> Push:
         do="pip install dengine[sim]",
     ):
         import mujoco
-    steps = round(1 / RATE_HZ / time_step_s)
+    steps = round(1 / RATE_HZ / time_step_s) if time_step_s > 0 else 0
     expect(
         math.isclose(steps * time_step_s, 1 / RATE_HZ),
         "a time step in seconds that divides 2 ms",
@@ -109,9 +109,9 @@ def _drive(mujoco: Any, model: Any, data: Any, conditions: Conditions, steps: in
     `mujoco` is the module, `model` and `data` are its model and its state, which is advanced in
     place, and `steps` is the number of physics steps per sample. The force after 40 samples at
     rest, with the part in the gripper, counts as zero; pushing is positive. The conditions say when
-    the gripper starts, how fast it is, how far it goes, and the limit of the force. In the last 8 N
-    below this limit the push slows down, and above the limit the gripper moves back, by the newest
-    sample.
+    the gripper starts, how fast it is, how far it goes, and the limit of the force. If the newest
+    sample is less than 8 N below this limit, the push slows down; if it is above the limit, the
+    gripper moves back.
     """
     for _ in range(_SETTLE_SAMPLES):
         mujoco.mj_step(model, data, steps)
@@ -188,7 +188,7 @@ def _spring(stiffness: float, inertia: float) -> str:
 
 
 def _part_xml(c: Conditions) -> str:
-    """Return the part of MuJoCo's model (MJCF, as text) that is the part in the gripper.
+    """Return the MuJoCo body (MJCF, as text) of the part in the gripper.
 
     It is "" if the grasp missed the part. Dry friction holds the part in the gripper until the
     force of the push exceeds `c.grip_n` newtons; then it slides, by at most about 12 mm up or down.

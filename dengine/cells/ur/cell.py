@@ -165,7 +165,8 @@ class UrCell(AbstractContextManager["UrCell"]):
         is over has NaN for the rest. `last` becomes the record of this insertion (trace and missing
         samples); a trace with missing samples is counted in `incomplete`. Raise CellError if the
         robot does not answer in time, fails, or its program stops; `last` is then None, or the
-        insertion if it was complete before, and nothing is counted.
+        insertion if it was complete before, or as much of it as came before a restart of the
+        controller, and nothing is counted.
         """
         self._execute_order(Verb.INSERT)
         if self.last is None:  # the start was lost, or the trigger is wrong
@@ -200,12 +201,13 @@ class UrCell(AbstractContextManager["UrCell"]):
         """Send an order (`verb`) to the robot, wait for its result, and return the result.
 
         The order gets the next number; after 200,000,000 comes 1. This call waits at most
-        `order_timeout` seconds. Packages that were received before are discarded. If the connection
-        is lost meanwhile, the order is written again at the first package of the next connection,
-        unless the order is 10 s old by then or the controller was restarted: a robot must not move
-        when nobody expects it. The order INSERT also waits, within the same time, for the end of a
-        trace that has begun. It sets `last` to the insertion, or to None if none was complete by
-        then. Raise CellError if the robot does not answer in time, fails, or its program stops.
+        `order_timeout` seconds. Packages that were received before are discarded. If there is no
+        connection, or it is lost meanwhile, the order is written at the first package of the next
+        connection, unless the order is 10 s old by then or the controller was restarted: a robot
+        must not move when nobody expects it. The order INSERT also waits, within the same time, for
+        the end of a trace that has begun. It sets `last` to the insertion, which a restart of the
+        controller cuts short, or to None if none was complete by then. Raise CellError if the robot
+        does not answer in time, fails, or its program stops.
         """
         newest = self.recorder.arm()  # discards what was received between orders
         self._number = self._number % MAX_NUMBER + 1

@@ -87,7 +87,7 @@ class PackageReader:
         """Add bytes, and yield every package that is complete; an incomplete rest is kept.
 
         Nothing is added before the iteration begins. Raise CellError for bytes that are no RTDE
-        package; packages before them have been yielded.
+        package; packages before them have been yielded, and every later call raises it again.
         """
         self._bytes += piece
         while len(self._bytes) >= HEADER.size:
@@ -185,7 +185,8 @@ def read_recipe(payload: bytes, names: Sequence[str], direction: str) -> RtdeRec
     Raises
     ------
     CellError
-        If the controller does not have a field, or the response has another number of types.
+        If the controller does not have a field or gives it a type that is not in `TYPES`, or the
+        response has another number of types.
     HeldError
         If another client writes a field.
     """

@@ -147,6 +147,9 @@ class RtdeRecorder(AbstractContextManager["RtdeRecorder"]):
     def record(self, timeout: float = 60.0) -> InsertionRecord:
         """Wait for the next insertion after the last one, or after a call of `arm`, and return it.
 
+        It may have begun before this call: the packages of the last 60 s are buffered. What came
+        earlier and was not read is lost.
+
         An insertion that is not complete after `timeout` seconds, for example because the
         controller fell silent, is returned with NaN for the missing samples. If packages are
         missing where it began, so that its start is unknown, all samples are NaN. If the controller

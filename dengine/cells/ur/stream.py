@@ -138,11 +138,11 @@ class RtdeClient:
     def _request(self, type_: PackageType, payload: bytes) -> bytes:
         """Send a request, wait for its response, and return the payload of the response.
 
-        The response has the type of the request, `type_`. Packages of another type (RTDE calls
-        every message a package) that arrive before it are dropped. But if the request is START, a
-        data package that arrives first counts as the response "accepted" (the byte 1), and is kept
-        for `rows`. Raise CellError if the connection is lost or silent for `timeout` seconds, or
-        for bytes that are no RTDE.
+        The response has the type of the request, `type_`. Packages of another type (RTDE, the
+        controller's protocol, calls every message a package) that arrive before it are dropped. But
+        if the request is START, a data package that arrives first counts as the response "accepted"
+        (the byte 1), and is kept for `rows`. Raise CellError if the connection is lost or silent
+        for `timeout` seconds, or for bytes that are no RTDE.
         """
         self._send(Package(type_, payload).to_bytes())
         while (package := next(self._incoming)).type is not type_:
@@ -297,8 +297,9 @@ class RtdeStream:
         """Yield the packages of the robot, each removed from the buffer, for this many seconds.
 
         Packages that are buffered already come first. The time runs from the first call of `next`
-        on the iterator; with 0 s or less nothing comes. If the stream is closed, the iteration ends
-        when the buffer is empty or the time is over.
+        on the iterator; with 0 s or less nothing comes. A lost connection raises nothing: the
+        iterator waits while the thread reconnects. If the stream is closed, the iteration ends when
+        the buffer is empty or the time is over.
         """
         end = time.monotonic() + seconds
         while (left := end - time.monotonic()) > 0:
@@ -343,7 +344,7 @@ class RtdeStream:
             try:
                 for values in client.rows():
                     self._count_and_buffer(Row(values, self._session))
-            except CellError as error:
+            except (CellError, ValueError, OverflowError) as error:  # also a time that is no number
                 client.close()
                 with self._news:
                     self._client = None
@@ -362,10 +363,10 @@ class RtdeStream:
         """Count a package and the packages missing before it, buffer it, and wake who waits in
         `rows`.
 
-        `row` is the package. Times are compared in whole steps of 1 / rate, rounded. One with the
-        same time as the package before is counted as repeated; one with an earlier time shows that
-        the controller was restarted, which is counted. If the buffer is full, its oldest package is
-        dropped.
+        `row` is the package. Times are compared in whole steps of 1 / rate, rounded. A package with
+        the same time as the package before also counts as repeated, and a package with an earlier
+        time counts as a restart of the controller; both are buffered, too. If the buffer is full,
+        its oldest package is dropped, which is not counted.
         """
         with self._news:
             if self._newest is not None:
@@ -381,11 +382,11 @@ class RtdeStream:
     def _connect(self, until: float = float("inf")) -> RtdeClient | None:
         """Try to connect until that succeeds; return the connection, None if the stream is closed.
 
-        Failures are noted in the attribute `trouble`, and the attempts go on, at intervals that
-        double from 0.05 to 1 s. But for the first connection of the stream `until` is given, a time
-        of `time.monotonic`: then a failure raises its CellError or SettingError at once, unless
-        another client of the controller still writes an input; for this the attempts go on until
-        that time.
+        A CellError or SettingError of an attempt is noted in the attribute `trouble`, and the
+        attempts go on, at intervals that double from 0.05 to 1 s. For the first connection of the
+        stream `until` is given, a time of `time.monotonic`: then the error is raised at once. Only
+        a HeldError (another client of the controller still writes an input) is raised no earlier
+        than at that time, and the attempts go on until then.
         """
         wait, longest_wait = RETRY_S
         while not self._closing.is_set():

@@ -80,9 +80,10 @@ def describe(source: Any, stated: Stated | None = None) -> Description:
     DataError
         If there is no file, or none that can be read and holds samples, or if the package that
         reads such files is not installed. Also if a stated value is wrong: an unknown key or a
-        value of the wrong type, a column of times or a channel that does not exist (a bag's are not
-        checked), a source of labels that has no words, a malformed pattern of files, or settings in
-        `[text]` or `[time]` that no file can be read with.
+        value of the wrong type, a column of times, a channel or, in the layout `long`, a
+        `part.column` that does not exist (a bag's are not checked), a source of labels that has no
+        words, a malformed pattern of files, or settings in `[text]` or `[time]` that no file can be
+        read with.
     SettingError
         If a stated `windows.trigger`, which cuts long recordings, is malformed.
     ValueError
@@ -107,13 +108,14 @@ def describe(source: Any, stated: Stated | None = None) -> Description:
 def choose_files(p: Proposal, root: Path) -> bool:
     """Set in `p` which files are the recordings, and their format; return whether that is clear.
 
-    If the user stated `files`, they are these. Otherwise they are the files in `root` with the only
-    likely ending (`likely_endings`). If there are several, `files` is set to `?` with a note that
-    lists them, a note on `channels` says so, and the result is False. Otherwise `p.base` becomes
-    the folder, `p.names` these files and `p.others` the other files that `names_in` finds without
-    patterns. `files` becomes `globs` of the names, and `format` that of the first file's suffix,
-    `text` for an unknown one; stated keys stay. `exclude` is not looked at. Raises DataError if
-    there is no file of recordings or a stated pattern is malformed.
+    If `root` is a file, it is the only one. In a folder they are the files that match the stated
+    `files`. If none are stated, they are the files with the only likely ending (`likely_endings`);
+    if several endings are likely, `files` is set to `?` with a note that lists them, a note on
+    `channels` says that the channels follow from `files`, and the result is False. If it is True,
+    `p.base` is the folder, `p.names` has these files and `p.others` the other files that `names_in`
+    finds without patterns. `files` becomes `globs` of the names, and `format` that of the first
+    file's suffix, `text` for an unknown one; stated keys stay. `exclude` is not looked at. Raises
+    DataError if there is no file of recordings or a stated pattern is malformed.
     """
     stated = p.description.files
     every = names_in(root, ())
@@ -167,8 +169,9 @@ def suffix_of(name: str) -> str:
 def names_in(root: Path, patterns: Names) -> Names:
     """Return the files of a folder that may be recordings: relative paths, run_2 before run_10.
 
-    Hidden files, descriptions, and files like README or LICENSE are left out. Without `patterns`,
-    files with an unknown suffix are left out too. If `root` is a file, the list has only its name.
+    Hidden files, files in hidden folders or outside of the folder (`../x.csv`), `recordings.toml`,
+    and files like README or LICENSE are left out. Without `patterns`, files with an unknown suffix
+    are left out too. If `root` is a file, the list has only its name.
     If nothing is there, the list is empty. Raises DataError for a malformed pattern, unless `root`
     is a file.
 
@@ -226,9 +229,9 @@ def table_in(p: Proposal, content: bytes, name: str) -> Table:
 
     An .npz file is read as one that holds all parts if it is the only file, or the layout `npz` is
     stated; but not if another layout is. Of a text or jsonl file of more than 2 MB only the whole
-    lines of the first 2 MB are read, and `p.is_cut` is set. Raises DataError if the file is
-    damaged, or if a line of a text file has a wrong number of cells; but such lines of the only
-    file are left out, unless all its lines are wrong.
+    lines of the first 2 MB are read (the whole file if no line ends there), and `p.is_cut` is set.
+    Raises DataError if the file is damaged, or if a line of a text file has a wrong number of
+    cells; but such lines of the only file are left out, unless all its lines are wrong.
     """
     about = p.description
     if about.format in ("text", "jsonl") and len(content) > MOST_BYTES:

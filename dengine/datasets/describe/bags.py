@@ -22,21 +22,27 @@ LISTING = "windows={listing=FILE, key=COLUMN, start=COLUMN, end=COLUMN}"
 
 
 def propose_bag(p: Proposal) -> None:
-    """Set in `p` the channels, the clock and the source of labels of a bag, and how it is cut.
+    """Set in `p` the channels, the clock and the source of labels of a ROS 2 bag.
 
-    It looks at the first 50,000 messages of the first file. The clock is the time in the messages'
-    headers if the first message of each topic has it, apart from topics with a field `data`, else
-    the time of the log; a time in a header below 1 s counts as none. The rate, `order` and
-    `time.gap` follow from the times of the log in any case (`propose_rate`), those of the first
-    channel's topic, or of the first number's if there is no channel. Whether stated channels are in
-    the bag is not checked. `traces.samples` is set to `?` unless it is stated; so is
-    `windows.trigger` unless it or `windows.listing` is stated, and `label.topic` unless anything of
-    the label is stated. The notes on the last two list the topics with a field `data`, and their
-    words. The words of a stated topic of labels are sorted into good and bad; with any other stated
-    source the lists that are not stated become `?`. Fields that are no channels become `ignored`.
-    Stated keys stay. Raises DataError if the file is no bag or is damaged before its first message,
-    or if the package that reads bags is missing, or if a setting in `[time]` is wrong; a later
-    damage only ends the reading.
+    Only the first 50,000 messages of the first file are looked at. Keys that the user stated stay.
+    `propose_channels` chooses a channel, or none, among the numbers in the first message of each
+    topic without a field `data`; the other numbers become `ignored`. Whether stated channels are in
+    the bag is not checked.
+
+    The clock is the time in the messages' headers if the first message of each of these topics has
+    it, else the time of the log, both in ns; a time in a header below 1 s counts as none. The rate,
+    `order` and `time.gap` follow from the times of the log in any case (`propose_rate`), those of
+    the first channel's topic, or of the first number's if there is no channel.
+
+    `traces.samples` becomes `?`, and so do `windows.trigger`, unless `windows.listing` is stated,
+    and `label.topic`, unless anything of the label is stated. The notes on the last two list the
+    topics with a field `data`, and their words. If anything of the label is stated, `with_meanings`
+    sorts the words of its topic into good, bad and unchecked. A list of good or bad words that is
+    not stated and gets no word becomes `?`; a label that is in no topic gives no words.
+
+    Raises DataError if the file is no bag or is damaged before its first message, if the package
+    that reads bags is missing, or if a setting in `[time]` is wrong; a later damage only ends the
+    reading. Raises SettingError for a malformed `windows.trigger`, unless channels are stated.
     """
     times, words = defaultdict[str, list[int]](list), defaultdict[str, list[str]](list)
     units = dict[str, str]()

@@ -84,11 +84,11 @@ def propose_clock(p: Proposal) -> None:
 def is_clock(column: Column) -> bool:
     """Return whether a column may hold the times of the samples.
 
-    Dates and times of day may if they change within a recording. So may a column that is named like
-    a clock (`time`, `stamp`, `t`, ...), if not all its cells are numbers and they change within a
-    recording, or if all are numbers that rise and it has no unit of another quantity, like N. They
-    may fall in at most 10 % of the steps, like a counter that begins again, or in at least 90 %, if
-    the newest row is the first.
+    The result is True for dates and times of day that change within a recording. It is also True
+    for a column that is named like a clock (`time`, `stamp`, `t`, ...), if not all its cells are
+    numbers and they change within a recording, or if all are numbers that rise and it has no unit
+    of another quantity, like N. Numbers count as rising if they fall in at most 10 % of the steps,
+    like a counter that begins again, or in at least 90 %, if the newest row is the first.
     """
     is_named = NAME.search(column.name) is not None
     if column.forms or (is_named and column.odd):
@@ -102,10 +102,11 @@ def is_clock(column: Column) -> bool:
 def is_counter(column: Column) -> bool:
     """Return whether a column that is not named like a clock may count samples or tell the time.
 
-    `Column.steps` decides. A column that is named like a counter (`index`, `sample`, `n`, ...) may
-    if its steps differ by more than 1 %. Any other may if they are equal, within 1 %, but not 0 or
-    1, unless it is named like a force, has a unit of a quantity that is not time, or is named like
-    `x*`, the samples of a wide table.
+    The steps from row to row (`Column.steps`) decide. For a column that is named like a counter
+    (`index`, `sample`, `n`, ...) the result is True if any step differs by more than 1 % from the
+    median step. For any other column it is True if no step does and the median is neither 0 nor 1;
+    but it is False if the column is named like a force, has a unit of a quantity that is not time,
+    or is named like `x*`, the samples of a wide table.
     """
     steps = column.steps
     usual = float(np.median(steps)) if len(steps) else 0.0
@@ -119,7 +120,7 @@ def is_counter(column: Column) -> bool:
 def epoch_of(column: Column) -> str:
     """Return the unit in which a column of times counts from a known day; "" if it does not.
 
-    With it the first number is a time in the years 2000 to 2050, counted from 1970 or from another
+    With it the first number is a time in the years 2000 to 2049, counted from 1970 or from another
     day that clocks use, and `Column.usual_step` is of a rate of 1 Hz to 1 MHz. The first unit in
     `EPOCHS` counts.
     """
@@ -137,9 +138,10 @@ def form_of(column: Column, p: Proposal) -> str:
 
     The form of dates or times of day comes first, then the unit that the file states or that stands
     in brackets in the column's name, the unit that dates of today prove (`epoch_of`), the unit in
-    the name, like `ms` of `t_ms`, `t in 0.1 ms` or `millis`, and what the size of the numbers
-    proves. A note on `time.format` in `p` says why it is `?`, or that only the size of the numbers
-    says s. If several forms of dates fit, so that day and month can be confused, the form is `?`.
+    the name, like `ms` of `t_ms`, `t in 0.1 ms` or `millis`, and what the size of the steps
+    proves (`_unit_by_size`). A note on `time.format` in `p` says why it is `?`, or that only the
+    size of the steps says s. If several forms of dates fit, so that day and month can be confused,
+    the form is `?`.
     """
     forms = column.forms
     if len(forms) > 1:
@@ -160,9 +162,9 @@ def form_of(column: Column, p: Proposal) -> str:
 def _unit_by_size(column: Column, p: Proposal) -> str:
     """Return the unit of time that the steps in a column prove; `?`, with a note, if none.
 
-    If `Column.usual_step` is 0.0002 to 0.019, it is s, and a note on `time.format` in `p` says so.
-    Otherwise it is `?`, and the note lists units with the rates that they give. It is `?`, too, if
-    the column has no numbers that change; the note then asks for the form of its cells.
+    If `Column.usual_step` is 0.0002 to 0.019, the unit is s, and a note on `time.format` in `p`
+    says so. Otherwise it is `?`, and the note lists units with the rates that they give. It is `?`,
+    too, if the column has no numbers that change; the note then asks for the form of its cells.
     """
     step = column.usual_step
     if not step:

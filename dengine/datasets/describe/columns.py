@@ -142,12 +142,12 @@ class Column:
 
     @cached_property
     def forms(self) -> list[str]:
-        """All forms of dates and times, like `%d.%m.%Y`, that fit the cells of the column.
+        """The forms of dates and times, like `%d.%m.%Y`, that fit all cells of the column.
 
-        The list is empty if a cell is empty or no date or time. The first 20 cells and the last
-        cell of each recording are looked at. If an ISO date fits, with or without a time of day, it
-        is the only form. A column of datetimes has only the form `iso`. Raises UnreadableError if
-        cells are lists.
+        Only those in `FORMS` are tried; the list is empty if none fits, for example because a cell
+        is empty. The first 20 cells and the last cell of each recording are looked at. If an ISO
+        date fits, with or without a time of day, it is the only form. A column of datetimes has
+        only the form `iso`. Raises UnreadableError if cells are lists.
         """
         if self.tables[0].columns[self.name].dtype.kind == "M":
             return [ISO]
@@ -207,10 +207,10 @@ class Proposal:
 
     @property
     def unused(self) -> list[Column]:
-        """The columns that have no role yet: no clock, part, label, channel, nor words for rows.
+        """The columns that have no role in the description yet.
 
-        Nor do signals of a trigger and the column of `order` count. Raises SettingError for a
-        malformed `windows.trigger`.
+        Columns of the clock, the part, labels, channels and `[rows]`, the column of `order` and the
+        signals of the trigger have one. Raises SettingError for a malformed `windows.trigger`.
         """
         about = self.description
         used = {*word_columns(about), *about.time.column, *signals_of(about)}

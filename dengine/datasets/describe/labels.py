@@ -131,7 +131,7 @@ def may_be_labels(source: LabelSource, words: Names) -> bool:
     `words` has the word of each recording, or of each row of a listing. There must be 2 to 12
     different ones, and on average at least two recordings for each. If the source is named like a
     verdict (`is_named_like_verdict`), the average does not matter, and one word is enough if it is
-    known to mean good or bad.
+    known to mean good or bad, or if the source states words for good or bad.
     """
     words = [*words]
     n = len({*words})
@@ -168,12 +168,13 @@ def part_words(source: PartSource, tables: Tables) -> Words:
 def sources_of(p: Proposal, paths: Names) -> Iterator[LabelSource]:
     """Yield the sources that may hold the labels.
 
-    They come in this order: pairs of columns of listings among `p.others`, of which one may name
-    the recordings or parts (`key`), since it has more different words than half of its rows, and
-    the other may hold labels; regular expressions for the paths (if a file or a column is a part),
-    of words like "ok" in them and of any words at fixed places; columns without another use that
-    have one word in all rows of a recording; and lines above the header. A file that cannot be read
-    as a listing is skipped. Raises SettingError for a malformed `windows.trigger`, and
+    They come in this order: pairs of columns of listings (files among `p.others` with a row for
+    each recording or part), of which one may name these (`key`), since it has more different words
+    than half of its rows, and the other may hold labels (`may_be_labels`); regular expressions for
+    the paths (if a file or a column is a part), of words like "ok" in them and of any words at
+    fixed places; columns without another use that have one word in all rows of a recording; and
+    lines above the header of the first table. A file that cannot be read as a listing is skipped.
+    Raises SettingError for a malformed `windows.trigger`, and
     UnreadableError if cells of a column without another use are lists.
 
     paths : the path of each recording.
@@ -197,10 +198,10 @@ def words_of(p: Proposal, source: LabelSource, tables: Tables, parts: Words) -> 
     """Return the word of each recording that has one in a source, by its `Table.source`.
 
     `tables` has the table of each recording, and `parts` their part numbers. A recording for which
-    a listing has rows with different words has none. If no recording has a word, also because
-    `source.path` is no regular expression with one group, DataError is raised for the stated
-    source; any other then gives an empty mapping. Raises DataError if the source's listing cannot
-    be read.
+    a listing has rows with different words has none. The mapping is empty if no recording has a
+    word, also because `source.path` is no regular expression with one group; but if the source is
+    the stated one, `p.description.label`, DataError is raised then. Raises DataError if the
+    source's listing cannot be read or lacks a column.
     """
     words = dict[str, str]()
     faults = list[Fault]()
@@ -228,12 +229,13 @@ def count_sources(p: Proposal, stated: Sequence[LabelSource]) -> dict[LabelSourc
 
     If the user stated a source, only that one is returned. Otherwise these are the sources that
     have few different words (`may_be_labels`), and a word for more than half of the recordings. A
-    source with the same words as an earlier one counts only if it is named like a verdict. For
-    listings and paths all recordings count, since their names are enough; for columns and lines
-    only those whose tables were read. The words are sorted into good, bad and unchecked as
-    `with_meanings` does; but in an archive of all parts 1 is good in an array y of 1 and 0. Raises
-    DataError if the stated source has no words or cannot be read, and SettingError for a malformed
-    `windows.trigger`.
+    source with the same words as an earlier one counts only if it is named like a verdict
+    (`is_named_like_verdict`). For listings and paths all recordings count, since their names are
+    enough; for columns and lines only those whose tables were read. The words are sorted into good,
+    bad and unchecked as `with_meanings` does; but in the layout `npz`, an archive of all parts, 1
+    is good and 0 is bad in an array y of 1 and 0, unless `label.good` is stated. Raises DataError
+    if the stated source has no words or cannot be read, or, if none is stated, if cells of a column
+    without another use are lists; and SettingError for a malformed `windows.trigger`.
 
     stated : the source that the user stated, `[label]`; empty if there is none.
     """
@@ -247,7 +249,8 @@ def count_sources(p: Proposal, stated: Sequence[LabelSource]) -> dict[LabelSourc
         is_new = words not in counted.values() or is_named_like_verdict(source)
         is_common = 2 * len(words) > len(tables if source.listing or source.path else p.tables)
         if stated or (is_new and is_common and may_be_labels(source, words.values())):
-            if (p.description.layout, source.column, source.good, {*words.values()}) == OWN:
+            meanings = source.good + source.bad
+            if (p.description.layout, source.column, meanings, {*words.values()}) == OWN:
                 source = replace(source, good=("1",), bad=("0",))
             counted[with_meanings(source, words.values())] = words
     return counted
@@ -256,17 +259,19 @@ def count_sources(p: Proposal, stated: Sequence[LabelSource]) -> dict[LabelSourc
 def propose_label(p: Proposal) -> None:
     """Set `[label]` and `[[check]]` in `p`: the source of the labels, and those that must agree.
 
-    A source is certain if it is named like a verdict or stated, has words for good and for bad, and
-    all its words have a known meaning. The first certain source becomes the label, unless another
-    source contradicts it: good by one, bad by the other. If none is certain, but only one is named
-    like a verdict, that becomes the label, with `?` for words whose meaning is open; but if it has
-    only known words, like "ok", this holds only if there is no other source. Sources that have the
-    same word for each recording count as one here, and the first that is named like a verdict is
-    used. Otherwise `label.column` is `?`, with a note that lists all sources. Further certain
-    sources that have a word for each recording of the label become checks, unless checks are
-    stated; a note counts the words of the label, also on `label.good` and `label.bad` if these are
-    `?`. Raises DataError if a stated source has no words or cannot be read, and SettingError for a
-    malformed `windows.trigger`.
+    A source is certain if it is named like a verdict (`is_named_like_verdict`) or stated, has words
+    for good and for bad, and all its words have a known meaning. The first certain source becomes
+    the label, unless another source contradicts it: good by one, bad by the other. If none is
+    certain, but only one is named like a verdict or stated, this source becomes the label. Its
+    `good` or `bad` is `?` if none of its words is known to mean that; a word of unknown meaning is
+    in neither list. But if it has only known words, like "ok", it becomes the label only if there
+    is no other source. Sources that have the same word for each recording count as one here, and
+    the first that is named like a verdict is used. Otherwise `label.column` is `?`, with a note
+    that lists all sources. Further certain sources that have a word for each recording of the label
+    become checks, unless checks are stated; a note counts the words of the label, also on
+    `label.good` and `label.bad` if these are `?`. Raises DataError if a stated source has no words
+    or cannot be read, or, if none is stated, if cells of a column without another use are lists;
+    and SettingError for a malformed `windows.trigger`.
     """
     label = p.description.label
     stated = [label] if any(getattr(label, kind) for kind in SOURCES) else []

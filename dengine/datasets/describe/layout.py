@@ -30,9 +30,10 @@ def layout_of(p: Proposal, files: Tables) -> str:
     or `npz` for an .npz file. It is `long` if a column of the first table may tell the parts apart
     (`may_tell_parts`), or if a file has several words of a stated `part.column`; unless it is
     stated, `part.column` is then set in `p` to the only such column with a name like that of a
-    part's number and no word in two files, or to `?` with a note. Several files, of which `p.names`
-    may have more than were looked at, are `files`. A single one gives `?`, with a note on what to
-    state. Raises UnreadableError if cells of columns that are looked at are lists.
+    part's number and no word in two files, or to `?` with a note; this clears `part.path` and
+    `part.line`, also stated ones. Several files, of which `p.names` may have more than were looked
+    at, are `files`. A single one gives `?`, with a note on what to state. Raises UnreadableError if
+    cells of columns that are looked at are lists.
     """
     kind = p.description.format
     first = files[0]
@@ -73,8 +74,9 @@ def may_tell_parts(column: Column) -> bool:
 
     A run is one word in successive rows. The runs must have 8 rows or more on average, and each
     word one run; if the column is named like a part's number (`part`, `serial`, `id`, ...), one run
-    in each table. False if a cell is empty, if no table has more than one word, and for any other
-    column that holds times or is named like them. Raises UnreadableError if cells are lists.
+    in each table. False if a cell is empty, if each table has one word in all its rows, and for a
+    column that is not named like a part's number, but holds times or is named like them. Raises
+    UnreadableError if cells are lists.
     """
     if not has_long_runs(column):
         return False
@@ -98,11 +100,12 @@ def parts_of(p: Proposal, files: Tables) -> list[Table]:
 
     `files` has the table of each file that is looked at, at least one. In the layout `long` a file
     holds several parts, one below the other; if any file was read only in part, the last of several
-    parts of each file is left out, since it may be cut. In `columns` each column is a part that
-    fits the first stated channel, if there is one. But those in `[rows]`, a stated `time.column`,
-    and those that are named like a clock in the first file, are no parts. Nothing is set in `p`.
-    Raises DataError if a file of the layout `long` does not have the columns in `part.column`, if
-    none is stated, or if their cells are lists.
+    parts of each file is left out, since it may be cut. In `columns` each column is a part; if
+    channels are stated, only each that fits the first of them. But those in `[rows]`, a stated
+    `time.column`, and those that are named like a clock in the first file, are no parts. Nothing is
+    set in `p`. Raises DataError if a file of the layout `long` does not have the columns in
+    `part.column`, if none is stated, or if their cells are lists; and UnreadableError if the
+    columns like `x0`, `x1` of one channel differ in length.
     """
     description, layout = p.description, p.description.layout
     patterns = [ANY] if layout == "columns" else numbered_columns(files[0])

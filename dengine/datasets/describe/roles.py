@@ -60,15 +60,16 @@ def propose_roles(p: Proposal) -> None:
 
     The columns are those of `p.tables`. In this order: columns that tell which rows are samples,
     clock, part, label, channels, and what follows from these: words for lost samples, rate, length
-    of the traces, order, ignored columns and files. A key is `?` if no rule proves a value. If it
-    is open which rows are samples, `traces.samples` is `?` and no rate is set; a clock with `?`
-    gives no rate either. `ignored` becomes the columns without any use, with their units, and
-    `exclude` the files in `p.others` without listings of labels, unless it is `?`. Stated keys
-    stay, but a stated `ignored` is replaced, and a stated `[rows]` gets further columns and words
-    (`qualify_rows`, `find_lost`). `p.columns` is set, and `p.tables` loses rows that are no
-    samples. Raises DataError if a stated column of times or channel does not exist, a setting in
-    `[time]` is wrong, a stated source of labels has no words or cannot be read, or cells are lists,
-    and SettingError for a malformed `windows.trigger`.
+    of the traces, order, ignored columns and files. If no rule proves a value, the key is `?`, or
+    stays empty like `[part]` and `[channels]`. If it is open which rows are samples,
+    `traces.samples` is `?` and no rate is set; a clock with `?` gives no rate either, and if its
+    column is `?`, `order` stays as it is. `ignored` becomes the columns without any use, with their
+    units. `exclude` becomes the files in `p.others` without listings of labels, if there are any,
+    unless `exclude` is `?`. Stated keys stay, but a stated `ignored` is replaced, and a stated
+    `[rows]` gets further columns and words (`qualify_rows`, `find_lost`). `p.columns` is set, and
+    `p.tables` loses rows that are no samples. Raises DataError if a stated column of times or
+    channel does not exist, a setting in `[time]` is wrong, a stated source of labels has no words
+    or cannot be read, or cells are lists, and SettingError for a malformed `windows.trigger`.
     """
     p.columns = columns_of(p.tables, p.description.text)
     for name in (*p.description.time.column, *p.description.channels):
@@ -100,7 +101,8 @@ def set_rows(p: Proposal, rows: Mapping[str, RowWords]) -> None:
 
     A recording keeps all rows if it lacks a column of `rows`, or has a word without a meaning
     there; all of them do while a `keep` is `?`. But a recording with one cell in such a column is
-    left out as a whole if the word of this cell drops it. Nothing changes if `rows` is empty.
+    left out as a whole if the word of this cell drops it; if that leaves out all recordings, all of
+    them stay, with all rows. Nothing changes if `rows` is empty.
     """
     if rows:
         p.description = replace(p.description, rows=rows)
@@ -115,13 +117,14 @@ def set_rows(p: Proposal, rows: Mapping[str, RowWords]) -> None:
 def qualify_rows(p: Proposal) -> None:
     """Find the columns that tell which rows are samples, and set them as `[rows]` in `p`.
 
-    Such a column has few words, and they change within a recording (`qualifies`). If it has
-    several, its `keep` is `?`, with a note that counts them; if it has one, that becomes its
-    `keep`. If the user stated some words of a column, its other words are added to `keep`, or to
-    `drop` if `keep` is stated: as `*` if they are more than 12, and not if `*` is stated. Rows that
-    are no samples are left out of `p.tables` and `p.columns`; but none are while a `keep` is `?`,
-    nor those of a recording that lacks a column of `[rows]`. Raises UnreadableError if cells are
-    lists, and SettingError for a malformed `windows.trigger`.
+    Of the columns without a role, `qualifies` says which ones they are. If such a column has
+    several words, its `keep` is `?`, with a note that counts them; if it has only one word, this
+    becomes its `keep`. If the user stated some words of a column, its other words are added to
+    `keep`, or to `drop` if `keep` is stated. If there are more than 12 others, `*` is added in
+    their place; if `*` is stated, nothing is added. Rows that are no samples are left out of
+    `p.tables` and `p.columns`; but none are while a `keep` is `?`, nor those of a recording that
+    lacks a column of `[rows]`. Raises UnreadableError if cells are lists, and SettingError for a
+    malformed `windows.trigger`.
     """
     rows = dict(p.description.rows)
     for name in rows.keys() & p.columns.keys():
@@ -152,12 +155,13 @@ def qualifies(column: Column, n_rows: int) -> bool:
     """Return whether the words of a column may tell which rows are samples.
 
     It must have a cell in each of the `n_rows` rows of all recordings, or one for each recording
-    that has it, and at most 12 different words, unless it is named like a status and has a text
-    that is not in `LOST`. The words must change within a recording, or one of several must name a
-    force or a torque. A column that is named like a status (`Status`, `valid`) may have numbers,
-    and also just one word in all; but if it is named like a verdict, too, and this word is known to
-    mean good or bad, it holds labels. Any other column must have texts, or empty cells if it is
-    named like a verdict, and must not be named like a clock.
+    that has it. It may have at most 12 different words; but their number does not matter if it is
+    named like a status (`Status`, `valid`) and has a text that is not in `LOST`. The words must
+    change within a recording, or there must be several words, of which one names a force or a
+    torque. A column that is named like a status may have numbers, and also just one word in all;
+    but if it is named like a verdict, too, and this word is known to mean good or bad, the result
+    is False, because the column holds labels. Any other column must have texts, or empty cells if
+    it is named like a verdict, and must not be named like a clock.
     """
     words = column.counts
     is_named = QUALIFIER_NAME.search(column.name) is not None
@@ -189,10 +193,11 @@ def sources_named(p: Proposal, column: re.Pattern[str], line: re.Pattern[str]) -
 def propose_part(p: Proposal) -> None:
     """Set `[part]` in `p` to the column or the line above the header that has the part's number.
 
-    Its name must be like that of a part's number, and the different words in it must be more than
-    half as many as `p.tables`. Columns that have a role are left out, and the lines are those of
-    the first table. If none qualifies, or several do, nothing is set. A `[part]` that is set
-    already stays. Raises SettingError for a malformed `windows.trigger`.
+    Its name must be like that of a part's number, and it must have more different words than half
+    the number of `p.tables`. Recordings in which it is missing, empty or changes give no word.
+    Columns that have a role are left out, and the lines are those of the first table. If none
+    qualifies, or several do, nothing is set. A `[part]` that is set already stays. Raises
+    SettingError for a malformed `windows.trigger`.
     """
     least = len(p.tables) / 2
     named = sources_named(p, PART_NAME, PART_LINE)
@@ -206,10 +211,11 @@ def propose_channels(p: Proposal, units: Mapping[str, str]) -> None:
 
     The rules are tried in order, and the first that any column fits decides: a name like a force
     along z, a name like a force, a unit of force or torque, a name like `F` or `value`, any column.
-    A name decides only if the unit is that of a force or torque, or unknown. If several columns fit
-    the rule, none is there, only other columns have a unit of force or torque, `_doubt_on` has a
-    reason against it, or `_other_scales` yields a text, the channels stay empty, with a note.
-    Raises SettingError for a malformed `windows.trigger`.
+    A name decides only if the unit is that of a force or torque, or unknown. The channels stay
+    empty, with a note, if `units` is empty, if several columns fit the rule, if the column that
+    fits has no unit of force or torque and another column has one, if `_doubt_on` has a reason
+    against a column, or if `_other_scales` yields a text. Raises SettingError for a malformed
+    `windows.trigger`.
 
     units : the columns that may be channels, with their units, "" for unknown.
     """
@@ -234,8 +240,9 @@ def _doubt_on(p: Proposal, name: str) -> str:
     """Return the first reason why a column may not be a channel; "" if there is none.
 
     The reasons: the column is named like a value that a controller aims at or like a limit
-    (`F_soll`, `set_force`, `F_max`); `name` is like `x*` and stands for the columns `x0`, `x1`,
-    ..., and a step between two of their numbers is longer than 1.5 usual steps, the median.
+    (`F_soll`, `set_force`, `F_max`); `name` is like `x*` and stands for the columns `x0`, `x1`, ...
+    of the first of `p.tables`, and a step from one of their numbers to the next is longer than 1.5
+    times the median step.
     """
     if SET_VALUE.search(name):
         return f"{name} may be a set value"
@@ -276,14 +283,14 @@ def find_lost(p: Proposal) -> None:
 
     They are those already there, and those of `LOST`, like `nan`, `-` or the empty cell, that a
     channel has, in any case of letters. If another text is in more than 1 % of a channel's cells,
-    or, in a text file, a number like -9999 or 1e30 in any, `text.missing` is `?`, with a note. If
-    more than 10 % of the cells of a channel are empty, "" is not added for it if `time.column` is
-    set, even to `?`: these rows belong to another signal. `[rows]` then drops them, unless it has
-    words of this channel already. It also gets each column without a role that has numbers and, in
-    up to 10 % of its cells, other words, not all in `LOST`, like `Max` in a footer; `keep` is `?`
-    there, with a note. Dropped rows are left out of `p.tables` and `p.columns` (see `set_rows`). A
-    stated `text.missing` stays, but `[rows]` changes all the same. Raises SettingError for a
-    malformed `windows.trigger`.
+    or if a cell of a text file has a number like -9999 or 1e30, `text.missing` is `?`, with a note.
+    If more than 10 % of the cells of a channel are empty, "" is not added for it if `time.column`
+    is set, even to `?`: these rows belong to another signal. `[rows]` then drops them, unless it
+    has words of this channel already. `[rows]` also gets each column without a role that changes
+    within a recording and has numbers and, in up to 10 % of its cells, other words, not all in
+    `LOST`, like `Max` in a footer; its `keep` is `?`, with a note. Dropped rows are left out of
+    `p.tables` and `p.columns` (see `set_rows`). A stated `text.missing` stays, but `[rows]` changes
+    all the same. Raises SettingError for a malformed `windows.trigger`.
     """
     rows = dict(p.description.rows)
     for column in p.unused:
@@ -319,9 +326,10 @@ def propose_lengths(p: Proposal) -> None:
 
     The length is that of the first channel; without one nothing is set. Recordings without rows are
     ignored; if all are, the length is 0. If some have another length, and `traces.lengths` is not
-    stated, a note counts them; if they are more than 10 %, `traces.lengths` becomes `pad`. A stated
-    `traces.samples` stays. Unless it is stated, another note counts the recordings that end with
-    two zeros or more, if they are more than 10 %: these may fill up shorter ones.
+    stated, a note counts them, and `traces.lengths` becomes `pad` if they are more than 10 % of the
+    recordings, else `strict`. A stated `traces.samples` stays. Unless it is stated, another note
+    counts the recordings that end with two zeros or more, if they are more than 10 %: the zeros may
+    fill up shorter recordings.
     """
     if p.description.channels:
         column = p.columns[next(iter(p.description.channels))]
@@ -344,11 +352,11 @@ def propose_order(p: Proposal) -> None:
     """Set `order` in `p` to `?`, with a note, if the file names, sorted, need not be the order.
 
     That is so if a file name stands in several folders, once the text of `label.path` is left out;
-    if a file name has a date that is written with the day, the month or AM and PM so that names do
-    not sort by it, or the names are not in the order of their dates; or if a column of `p.unused`
-    has one date or time per recording, and these, as `natural_key` sorts texts, are in another
-    order. If several hold, the note is on the last. An `order` that the user stated stays. Raises
-    SettingError for a malformed `windows.trigger`.
+    if a file name has a date with the day or the month first, the month as a word, or AM or PM, by
+    which names do not sort; if the names are not in the order of their dates; or if a column of
+    `p.unused` has one date or time per recording, and these, as `natural_key` sorts texts, are in
+    another order. If several of these hold, the note is on the last. An `order` that the user
+    stated stays. Raises SettingError for a malformed `windows.trigger`.
     """
     paths = [without_label(p.description.label, without_suffix(name)) for name in p.names]
     names = [path.rpartition("/")[2] for path in paths]

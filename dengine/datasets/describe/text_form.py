@@ -9,6 +9,7 @@ from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, replace
 from itertools import product
+from operator import itemgetter
 from statistics import mode
 from typing import NamedTuple
 
@@ -32,6 +33,7 @@ MOST_BYTES = 2_000_000  # of a file that are read
 MOST_LINES = 200  # by which the delimiter and the first row of samples are found
 MOST_NAMES = 20  # columns without a header that get a name each
 DIGITS = re.compile(r"\d+")
+FRACTION = re.compile(r"-?\d+,0\d+")  # no two whole numbers: none is written 05
 WHOLE = re.compile(r"-?\d+(\.0*)?(e\+00)?")
 UNIT_WORDS = re.compile(
     r"(?i)[\[(]?(hh:mm(:ss)?|dd\.mm\.yyyy|[\d.]+ ?[mu]?s|[mun]?s(ecs?)?|min|h)[\])]?"
@@ -54,15 +56,17 @@ class Look(NamedTuple):
 
 
 def look(content: bytes, stated: Stated) -> Look:
-    """Return how a text file is written, and the cells of its samples, from its first 2 MB.
+    """Return how a text file is written, and the cells of its samples.
 
-    The result has the text form, the number of columns, the line of the header ("" for none) and
-    the cells of each line from the first row of samples on, also of lines of another form. The
-    delimiter and the first row follow from the first 200 lines; of delimiters with equal scores the
-    one with more cells is taken. If none splits the usual line into cells, there is a single
-    column, and the delimiter is a comma. The marks in numbers stay those of `TextForm`. `content`
-    has the bytes of the file. Raises DataError if it is empty or no text, or if the line of its
-    header is not certain, and LookupError for a stated encoding that Python does not know.
+    Only its first 2 million characters are looked at. The result has the text form, the number of
+    cells in a row, whether a delimiter ends each row (its last cell is then empty), the line of the
+    header ("" for none) and the cells of each line from the first row of samples on, also of lines
+    of another form. The delimiter and the first row follow from the first 200 lines; of delimiters
+    with equal scores the one with more cells is taken. If none splits the usual line into cells,
+    there is a single column, and the delimiter is a semicolon, or the stated one. The marks in
+    numbers stay those of `TextForm`. `content` has the bytes of the file. Raises DataError if it is
+    empty or no text, or if the line of its header is not certain, and LookupError for a stated
+    encoding that Python does not know.
 
     stated : keys that the user gave. `text.encoding` and `text.delimiter` are taken; `text.header`
     only says that a doubt about the header is no error.
@@ -72,7 +76,8 @@ def look(content: bytes, stated: Stated) -> Look:
     if not text.strip():
         raise DataError("Expected a text, got an empty file.")
     marks = stated.get("text.delimiter", DELIMITERS)
-    _, width, delimiter = max(_share_of_numbers(lines[:MOST_LINES], mark) for mark in marks)
+    scores = (_share_of_numbers(lines[:MOST_LINES], mark) for mark in marks)
+    _, width, delimiter = max(scores, key=itemgetter(0, 1))
     rows = [[*map(str.strip, split_line(line, delimiter))] for line in lines]
     data = _first_row(rows[:MOST_LINES], width)
     is_closed = not any(row[-1] for row in rows[data:] if len(row) == width)
@@ -98,21 +103,23 @@ def decode(content: bytes, stated: str) -> tuple[str, str]:
 
 
 def _share_of_numbers(lines: Sequence[str], delimiter: str) -> tuple[float, int, str]:
-    """Return a score of how well a delimiter splits lines into numbers, the cells per line, and it.
+    """Return the score of a delimiter, the most frequent number of cells, and the delimiter.
 
-    The score is the share of lines with the most frequent number of cells, times the share of
-    numbers among their cells that are not empty, plus 0.01; it is divided by 1.15 if the delimiter
-    is a blank, since cells may have blanks in them, and rounded to two decimals, so that near
-    scores are equal. If the lines have fewer than 2 cells, or all cells are empty, the result is a
-    score of 0 for a single column, with a comma as its delimiter. The first third of the lines,
-    which may be text above the samples, and empty lines are left out.
+    The score says how well the delimiter splits the lines into numbers. It is the share of lines
+    with the most frequent number of cells, times the share of numbers among their cells that are
+    not empty, plus 0.01; it is divided by 1.15 if the delimiter is a blank, since cells may have
+    blanks in them, and rounded to two decimals, so that near scores are equal. If the most frequent
+    number is below 2, all these cells are empty, or a whole line is like `5,04`, with a decimal
+    comma, and the delimiter is a comma, the result is a score of 0 and a single cell. The first
+    third of the lines, which may be text above the samples, and empty lines are left out.
     """
     rows = [split_line(line, delimiter) for line in lines[len(lines) // 3 :] if line.strip()]
     width = mode([*map(len, rows), 0])
     same = [row for row in rows if len(row) == width]
     cells = [cell for row in same for cell in row if cell.strip()]
-    if width < 2 or not cells:
-        return 0.0, 1, ","
+    is_decimal = delimiter == "," and any(map(FRACTION.fullmatch, lines))
+    if width < 2 or not cells or is_decimal:
+        return 0.0, 1, delimiter
     share = len([*filter(NUMBER.fullmatch, cells)]) / len(cells) * len(same) / len(rows) + 0.01
     return round(share / (BLANKS_LEAD if delimiter == BLANK else 1), 2), width, delimiter
 
@@ -150,11 +157,12 @@ def is_numbering(cells: Sequence[str]) -> bool:
 def _head_lines(rows: Rows, width: int, stated: Stated) -> tuple[int, int]:
     """Return the lines, from 1, of the header and of the units above the samples; 0 for none.
 
-    The header is the last line with a word and at least `width` cells, the number of columns. But
-    if more than half of its words are units, and an earlier line is as wide, it is the line of the
-    units, and the earlier one is the header. If the header has a unit among its names, or a name
-    twice, and the wide line before it has no empty cell, the line before may be the header instead.
-    DataError is raised then, unless `stated` has the key `text.header`; its value is not used here.
+    The header is the last line with at least `width` cells, the number of columns, and a word,
+    which is any cell that is not empty. But if more than half of its words are units, and an
+    earlier line is such a line, too, it is the line of the units, and the earlier one is the
+    header. If the header has a unit among its names, or a name twice, and the wide line before it
+    has no empty cell, the line before may be the header instead. DataError is raised then, unless
+    `stated` has the key `text.header`; its value is not used here.
 
     rows : the cells of the lines above the samples.
     """
@@ -177,12 +185,12 @@ def propose_form(p: Proposal, contents: Mapping[str, bytes], faults: list[Fault]
     """Set `[text]` in `p` to the text form of most files; return the names of these files.
 
     Files with another delimiter, number of columns or header are left out: they move from `p.names`
-    to `p.others`. If two or more of them have at least 8 rows of samples, or one whose name differs
-    from that of a file of the form in `[text]` by a number only, `exclude` is set to `?`, with a
-    note that asks whether they are recordings. For a file that is no text, or whose header is not
-    certain, a fault is appended to `faults`, and it stays in `p.names`; if all are such, nothing is
-    set and returned. Of equally frequent forms the first counts. Stated keys stay. Raises
-    LookupError for a stated encoding that Python does not know.
+    to `p.others`. If two or more of them have at least 8 rows of samples, or if a single one has,
+    and its name differs by a number only from that of a file in the result, `exclude` is set to
+    `?`, with a note that asks whether they are recordings. For a file that is no text, or whose
+    header is not certain, a fault is appended to `faults`, and it stays in `p.names`; if all are
+    such, nothing is set, and the result is empty. Of equally frequent forms the first counts.
+    Stated keys stay. Raises LookupError for a stated encoding that Python does not know.
 
     contents : the contents of the files that are looked at, by name.
     """
@@ -206,13 +214,13 @@ def propose_form(p: Proposal, contents: Mapping[str, bytes], faults: list[Fault]
 
 
 def _propose_keys(p: Proposal, looks: Sequence[Look]) -> None:
-    """Set the keys of `[text]` in `p`, as the first of these files is written.
+    """Set the keys of `[text]` in `p` to the form of the first of these files.
 
     If the header stands at different lines, or the user stated a text for it, `text.header` becomes
     its text, and `text.units` and `text.data` are counted from it. If any file is read as cp1252,
     the first such file counts instead, and a note says that the encoding is guessed.
-    `_column_names` gives the names; a stated header other than 0 needs none. `propose_marks` sets
-    the marks in numbers. Stated keys stay.
+    `_column_names` gives `text.names`, which is empty if the user stated a header other than 0.
+    `propose_marks` sets the marks in numbers. Stated keys stay.
 
     looks : how each of the files, which are of one form, is written, and the cells of its samples.
     """
@@ -235,12 +243,13 @@ def _propose_keys(p: Proposal, looks: Sequence[Look]) -> None:
 def _column_names(usual: Look) -> Sequence[str]:
     """Return the names for `text.names`; empty if the header names each column.
 
-    If the header has only empty cells beyond the last column, the names are those of the header; so
-    they are if it lacks the last column and this is empty, and then that is named like `column3`.
-    Without a header, or if it has another number of words, the names are `c0`, `c1`, ...; for 20
-    columns or more it is `x*`, which names all of them. Such a table may have a part in each row:
-    if its first column has 2 to 12 different words, all whole numbers, and fewer of them than the
-    second, it is named `class`, before `x*`.
+    `#` or `%` at the beginning of the header is skipped. If the header has only empty cells beyond
+    the last column, the names are those of the header. If it lacks the last column, and this is
+    empty in all rows, the names are those of the header and one like `column3`. Without a header,
+    or if it has another number of cells, the names are `c0`, `c1`, ...; for 20 columns or more it
+    is `x*`, which names all of them. Such a table may have a part in each row: if its first column
+    has 2 to 12 different words, all whole numbers, and the second column has more different words,
+    the first is named `class`, before `x*`.
 
     usual : how a typical file is written, and the cells of its samples.
     """

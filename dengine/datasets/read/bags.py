@@ -90,8 +90,8 @@ def read_bag(
     ------
     DataError
         If the channels are of several topics, if no message of their topic can be read (also
-        because the package that reads bags is not installed), or if a trigger cuts the bag and
-        there is a fault before its last file.
+        because the package that reads bags is not installed), or if `windows.trigger`, which cuts
+        the bag into parts, is stated and there is a fault before its last file.
     SettingError
         If the trigger is malformed.
     """

@@ -36,7 +36,8 @@ def has_day(unit: str) -> bool:
 def scale_of(unit: str) -> float:
     """Return how many seconds a unit of time has: 0.001 for `ms`, 1e-6 for `0.001 ms`.
 
-    The units are s, sec, ms, us, µs, ns, min, h and d. Raises DataError for any other text.
+    The units are s, sec, ms, us, µs, ns, min, h and d; a decimal number may stand before a unit.
+    Raises DataError for any other text.
     """
     match = re.fullmatch(r"(\d+\.?\d*|\.\d+)?\s*([^\d.]+)", unit.strip())
     if not match or match[2] not in UNITS:
@@ -77,7 +78,8 @@ def times_of(table: Table, clock: Clock, form: TextForm) -> Floats:
     ------
     UnreadableError
         If a column is missing, empty or of another length, or a cell is no time of the stated form
-        (a missing number, too), or no single time because clocks are changed.
+        (a missing number, too), or no single time because clocks are changed, or if the cells of a
+        column have several offsets from UTC.
     DataError
         If a format is no unit of time.
     """

@@ -53,7 +53,8 @@ def match_files(root: Path, patterns: Sequence[str]) -> set[str]:
     """Return the files below a folder that any pattern matches, as paths relative to the folder.
 
     The paths have `/` between folders. Folders that match are left out; `**` at the end stands for
-    all files below. Raises DataError for a malformed pattern.
+    all files below. Hidden files (`.x.csv`) match, too, and a pattern with `..` finds files outside
+    the folder. Raises DataError for a malformed pattern.
     """
     with instead(
         DataError, f"Expected patterns below a folder in files and exclude, got {patterns}", *BAD
@@ -65,9 +66,10 @@ def match_files(root: Path, patterns: Sequence[str]) -> set[str]:
 def find_files(root: Path, description: Description) -> list[str]:
     """Return the files that a description names, as paths relative to the folder.
 
-    They are sorted by file name, run_2 before run_10. Listings, the description file and files that
-    match a pattern in `exclude` are left out. If `root` is a file, its name alone is returned,
-    whatever the description says. Raises DataError if no file is left, or for a malformed pattern.
+    They are sorted by file name, run_2 before run_10. The file `recordings.toml`, the listings of
+    labels and parts that the description names, and files that match a pattern in `exclude` are
+    left out. If `root` is a file, its name alone is returned, whatever the description says. Raises
+    DataError if no file is left, or for a malformed pattern.
     """
     if root.is_file():
         return [root.name]

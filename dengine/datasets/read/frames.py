@@ -50,7 +50,7 @@ def read_objects(content: bytes, source: str, form: TextForm, has_lines: bool) -
 
 
 def _table_of(source: str, rows: Rows, wanted: str) -> Table:
-    """Return a table of rows; raise UnreadableError, which says what was `wanted`, without rows.
+    """Return a table of rows; without rows raise UnreadableError, which says what was `wanted`.
 
     A cell is None if its row lacks the column. `source` is the name of the file.
     """
@@ -144,8 +144,9 @@ def read_frame(frame: Any, source: str) -> Table:
 def read_parquet(content: bytes, source: str) -> Table:
     """Return the table of a Parquet file.
 
-    `content` has its bytes, and `source` is its name in errors. Raises DataError if it is not a
-    Parquet file, or if pyarrow is not installed.
+    `content` has its bytes, and `source` is its name in errors. An index that pandas stored in it
+    is a column if it has a name, and is left out otherwise. Raises DataError if it is no Parquet
+    file or is damaged, or if pyarrow is not installed.
     """
     with read_errors(source, "a Parquet file", "pyarrow", "files"):
         import pandas as pd
@@ -158,10 +159,10 @@ def read_npz(content: bytes, source: str, has_all: bool) -> Table:
 
     Of one part, axes of length 1 are dropped; then an array (n,) becomes a column, and an array
     (C, n), or (n, C) with C < n, a column for each channel. Of all parts, each array is a column
-    whose cell i is its item i, and there are as many rows as the array with most numbers has items.
-    `content` has the bytes of the archive, and `source` is its name in errors. Raises DataError if
-    it is damaged, has Python objects or needs too much memory (`read_archive`), and UnreadableError
-    if it has no array.
+    whose cell i is its item i, and there are as many rows as the array with most numbers has items;
+    an array with more or fewer items stays as it is. `content` has the bytes of the archive, and
+    `source` is its name in errors. Raises DataError if it is no archive, is damaged, has Python
+    objects or needs too much memory (`read_archive`), and UnreadableError if it has no array.
     """
     arrays, _ = read_archive(content, name=source)
     if not arrays:

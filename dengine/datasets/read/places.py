@@ -101,10 +101,10 @@ def words_of(
 def part_of(source: PartSource, table: Table) -> str:
     """Return the part number of a recording by `[part]`, `source`; "" if that states nothing.
 
-    The words of several columns are joined by blanks. Raises UnreadableError if the stated column,
-    line or match is missing, or it or any of several columns is empty, or if the rows or such lines
-    of the recording have different numbers, or a column has lists or no rows, and DataError if the
-    stated path is no regular expression with one group.
+    The words of several columns are joined by blanks. Raises UnreadableError if a stated column,
+    line or match is missing or its word is empty, if the words of the recording's rows, or of
+    several lines with the stated beginning, differ, or if a column has lists or no rows; and
+    DataError if the stated path is no regular expression with one group.
     """
     words = words_of(source, table, source.column)
     if not all(words):
@@ -115,12 +115,13 @@ def part_of(source: PartSource, table: Table) -> str:
 def listing_table(path: Path, form: TextForm) -> Table:
     """Return the table of a listing, which is a Parquet file or a text file.
 
-    A name that ends in `.parquet` tells the first. The first line of a text has the names of the
-    columns; the delimiter is the first of `, ; tab |` that is most frequent in it. Cells of a text
-    stay texts. Of `form` only the encoding is used; a text that is not in it is read as cp1252.
-    Raises UnreadableError if the file cannot be read, has a zero byte or no rows, or a row has
+    A name that ends in `.parquet` tells the first; a text whose name ends in `.gz` is unpacked. The
+    first line of a text has the names of the columns; the delimiter is the first of `, ; tab |`
+    that is most frequent in it. Cells of a text stay texts. Of `form` only the encoding is used; a
+    text that is not in it is read as cp1252. Raises UnreadableError if the file cannot be read, if
+    a text has a zero byte, an empty first line or nothing below it, or if a row of a text has
     another number of cells; DataError for a damaged Parquet file or without pyarrow; and
-    LookupError for an encoding that Python does not know.
+    LookupError for an encoding that Python does not know. A Parquet file may have no rows.
     """
     content = read_file(path)
     if path.suffix.lower() == ".parquet":
@@ -204,9 +205,8 @@ class LabelReader:
         `table` is the table of the recording, and `part` its part number. If the source is a
         listing, the key that was found in it is added to `used`, the keys found so far. Words are
         compared exactly; a word that is stated for several meanings is good before bad, and bad
-        before not checked. Raises UnreadableError if there is no word or several (see `word`), or
-        if it has no stated meaning (an empty word, too), and DataError if `source.path` is no
-        regular expression with one group.
+        before not checked. Raises what `word` raises, and UnreadableError if the word, which may
+        be empty, has no stated meaning.
         """
         source = self.source
         word = self.word(table, part)
@@ -221,7 +221,9 @@ class LabelReader:
     def unused_note(self) -> str:
         """Return a sentence on rows of the listing that name no recording, "" if there is none.
 
-        It has the keys of up to eight of them. It counts keys, so rows with one key count once.
+        These are the rows whose key is not in `used`, also if their recording failed before its
+        word was looked up. The sentence has up to eight keys, and counts keys: rows with the same
+        key count once.
         """
         unused = sorted(self.listing.keys() - self.used.keys(), key=natural_key)
         if not unused:
@@ -246,10 +248,11 @@ def as_key(word: str) -> str:
 def read_labels(base: Path, source: LabelSource, form: TextForm) -> LabelReader:
     """Return the reader of a source of labels, after reading its listing, if it has one.
 
-    The listing stands in the folder `base`, and is a text in the encoding of `form` or a Parquet
-    file. Raises DataError if it cannot be read, or if `source.key` and `source.column`, the columns
-    of keys and words in it, are not both stated and there, and LookupError for an encoding that
-    Python does not know. Whether `source.path` is a regular expression is not checked here.
+    The listing stands in the folder `base`, and is a Parquet file, or a text in the encoding of
+    `form` or else in cp1252 (see `listing_table`). Raises DataError if it cannot be read, or if
+    `source.key` and `source.column`, the columns of keys and words in it, are not both stated and
+    there, and LookupError for an encoding that Python does not know. Whether `source.path` is a
+    regular expression is not checked here.
     """
     listing = defaultdict[str, set[str]](set)
     if source.listing:

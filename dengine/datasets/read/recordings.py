@@ -40,10 +40,10 @@ def recording_of(
 
     Rows that `[rows]` drops are left out, then rows are sorted by time if `time.sort` is set, and
     their times are checked (`check_steps`); samples of rows that `[rows]` calls invalid are NaN.
-    The `length` of the recording is the number of rows kept. Each listing's reader notes its key in
-    `used`. The times and samples of a part that was not checked must be readable, too, but may be
-    of any length. If `[part]` states nothing, a part that `[windows]` cuts has its key as part
-    number.
+    The `length` of the recording is the number of rows kept. A reader of a listing adds the key
+    that it found to its `used`. The times and samples of a part that was not checked must be
+    readable, too, but may be of any length. If `[part]` states nothing, a part that `[windows]`
+    cuts has as part number its key in the listing, or its number from 1 if a trigger cuts.
 
     Parameters
     ----------
@@ -65,21 +65,21 @@ def recording_of(
     form = description.text
     order = description.order
     table = kept_rows(table.whole(), description.rows)
-    seconds = None
+    seconds = times_of(table, clock, form) if clock.column else None
     rank: Any = ""
-    if clock.column:
-        seconds = times_of(table, clock, form)
+    samples = [samples_of(table, *item, form) for item in description.channels.items()]
+    lengths = [*map(len, samples if seconds is None else [*samples, seconds])]
+    if len({*lengths}) > 1:
+        raise UnreadableError(f"Expected channels and times of one length, got {lengths}")
+    if seconds is not None:
         if clock.sort:
             rows = np.argsort(seconds, kind="stable")
             with instead(UnreadableError, "Expected columns of one length", IndexError):
                 table = table.take(rows)
             seconds = seconds[rows]
+            samples = [values[rows] for values in samples]
         check_steps(seconds, clock, table)
         rank = seconds[0] if order == "time" else rank
-    samples = [samples_of(table, *item, form) for item in description.channels.items()]
-    lengths = [*map(len, samples if seconds is None else [*samples, seconds])]
-    if len({*lengths}) > 1:
-        raise UnreadableError(f"Expected channels and times of one length, got {lengths}")
     for column, about in description.rows.items():
         is_lost = np.array(about.kinds(table.words(column))) == "invalid"
         samples = [np.where(is_lost, np.nan, values) for values in samples]
@@ -326,8 +326,8 @@ def fitted(samples: Floats, seconds: Floats | None, description: Description) ->
     `seconds`, shape (n,), has the times of the samples; None without a clock. With
     `resample`, times and a stated rate, the samples are interpolated at that rate from the first
     time on. A longer recording loses its end; one that ends up to one step early is accepted, and
-    its last sample repeated. With times but without a rate the whole recording is interpolated
-    evenly, if it has half to twice T samples. Otherwise it is fitted like a live trace
+    its last sample repeated. With `resample` and times, but without a rate, the whole recording is
+    interpolated evenly, if it has half to twice T samples. Otherwise it is fitted like a live trace
     (`can_fit_length`, `fit_length`); `pad-all` takes any length but 0, and repeats the last sample
     or drops the end.
 

@@ -22,10 +22,11 @@ OBJECTS = ("json", "jsonl", "ts")
 def table_of(content: bytes, name: str, description: Description) -> Table:
     """Return the table of a file in the format of the description.
 
-    Any other format than `ts`, `json`, `jsonl`, `parquet` and `npz` is read as text. `content` has
-    the bytes of the file, and `name` is its name in errors. Raises UnreadableError or DataError if
-    the file does not have this format, and DataError without pyarrow for a Parquet file. Raises
-    LookupError for an encoding that Python does not know.
+    Any other format than `ts`, `json`, `jsonl`, `parquet` and `npz` is read as text. An .npz file
+    is read as all parts, row by row, if the layout is `npz`, `wide` or `long`, otherwise as one
+    part. `content` has the bytes of the file, and `name` is its name in errors. Raises
+    UnreadableError or DataError if the file does not have this format, and DataError without
+    pyarrow for a Parquet file. Raises LookupError for an encoding that Python does not know.
     """
     kind = description.format
     form = description.text
@@ -36,14 +37,15 @@ def table_of(content: bytes, name: str, description: Description) -> Table:
     if kind == "parquet":
         return frames.read_parquet(content, name)
     if kind == "npz":
-        return frames.read_npz(content, name, description.layout == "npz")
+        return frames.read_npz(content, name, description.layout in ("npz", "wide", "long"))
     return read_text(content, name, form, word_columns(description))
 
 
 def word_columns(description: Description) -> set[str]:
     """Return the columns whose cells are read as words, also if they are channels, too.
 
-    These are dates, part numbers, labels, the column of `order` and those in `[rows]`.
+    These are dates, times of day, part numbers, labels, the column of `order` and those in
+    `[rows]`. The set also has "" if `[label]` or a `[[check]]` names no column.
     """
     clock = description.time
     forms = zip(clock.column, clock.format, strict=False)
@@ -90,7 +92,8 @@ def split(table: Table, description: Description) -> Iterator[Table]:
     one stands between its first and last row or directly beside these, or if rows of other parts
     stand between its own without `time.sort`. In `columns` and for a whole file, all damage of the
     file counts. Raises DataError if `part.column` of the layout `long` is not stated, is not in the
-    table or has lists as cells.
+    table or has lists as cells, UnreadableError if the numbered columns of one channel differ in
+    length, and RuntimeError for the layout `columns` without a channel.
     """
     table = replace(table, path=table.source)
     layout = description.layout
@@ -149,7 +152,8 @@ def _split_wide(table: Table, description: Description) -> Iterator[Table]:
     these columns, and they are in no part themselves. A list in any other cell becomes a column, or
     several; a column without a cell for each row is in every part as a whole, and an empty one in
     none. A part has damage if its row had a wrong number of cells. If the items of a list in it are
-    not all alike, that is its only damage, and it has no columns.
+    not all alike, that is its only damage, and it has no columns. Raises UnreadableError if the
+    columns of a channel like `x*` differ in length.
     """
     n = len(table.lines)
     origin: dict[str, list[str]] = {}
@@ -197,10 +201,11 @@ def match_numbered(key: str, columns: Iterable[str]) -> list[re.Match[str]]:
 def _split_columns(table: Table, description: Description) -> Iterator[Table]:
     """Yield for each column that matches the first channel a table, which is a part.
 
-    The channel's name may have a `*` for any text. The columns of times and of `[rows]` are in each
-    table, too, and are no parts; other columns are in none. In its table the column has the
-    channel's name, and `path` is its own name. Rows below the last cell of the part that is not
-    empty or NaN are left out. Damage of the file is damage of each part.
+    The channel's name may have a `*` for any text; without a channel RuntimeError is raised. The
+    columns of times and of `[rows]` are in each table, too, and are no parts; other columns are in
+    none. In its table the column has the channel's name, and `path` is its own name. Rows below the
+    last cell of the part that is not empty or NaN are left out. Damage of the file is damage of
+    each part.
     """
     channel = next(iter(description.channels))
     shared = {*description.time.column, *description.rows}
@@ -222,7 +227,8 @@ def _split_columns(table: Table, description: Description) -> Iterator[Table]:
 def without_empty_end(cells: Cells) -> Cells:
     """Return the cells of a column, shape (n,), without those at the end that are empty or NaN.
 
-    The texts "NaN" and "nan" count as NaN. All other cells stay, also empty ones between them.
+    None and blanks are empty, and the texts "NaN" and "nan" are NaN. All other cells stay, also
+    empty ones between them.
     """
     n = len(cells)
     while n and as_word(cells[n - 1]) in ("", "NaN", "nan"):

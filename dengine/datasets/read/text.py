@@ -46,13 +46,14 @@ def read_text(
     -------
     Table
         A line with a wrong number of cells is in its `damage`, and its row has empty cells. Empty
-        lines and those that `form.drop` names are left out; if all are, it has no rows.
+        lines and those that `form.drop` names are left out, so that it may have no rows.
 
     Raises
     ------
     UnreadableError
-        If the file has no line for samples, has another encoding, lacks a stated text of the
-        header, or has neither header nor stated names, or if all rows have a wrong number of cells.
+        If nothing but line ends stands where the samples begin, if the file has another encoding or
+        a zero byte, lacks a stated text of the header, or has neither header nor stated names, or
+        if all rows have a wrong number of cells.
     LookupError
         If Python does not know the encoding.
     """
@@ -81,8 +82,9 @@ def to_utf8(content: bytes, encoding: str) -> bytes:
     """Return the bytes of a text in UTF-8, with plain line feeds and without a byte order mark.
 
     `encoding` is the encoding of `content`. Raises UnreadableError, with the line (1 if the
-    encoding does not say where), if a byte does not fit the encoding or if the text has a zero
-    byte, and LookupError for an encoding that Python does not know.
+    encoding does not say where, or if lines end with a carriage return alone), if a byte does not
+    fit the encoding or if the text has a zero byte, and LookupError for an encoding that Python
+    does not know.
     """
     try:
         content = content.decode(encoding).removeprefix("\ufeff").encode("utf-8", "replace")
@@ -144,10 +146,10 @@ def _header_line(content: bytes, header: str) -> int:
 def _names(top: Sequence[str], header: int, form: TextForm) -> list[str]:
     """Return the names of the columns: those of `text.names`, otherwise the cells of the header.
 
-    A last name `x*` of `text.names` becomes `x0`, `x1`, ..., as many as the first row of samples
-    has cells left. In the header `#` or `%` at the beginning is skipped, an empty cell is called
-    by its number, like `column1`, and a name that repeats gets a number, like `X.2`. Raises
-    UnreadableError if there are neither names nor a header.
+    A last name `x*` of `text.names` becomes `x0`, `x1`, ..., as many as the line `text.data` has
+    cells left, even if `text.drop` leaves this line out. In the header `#` or `%` at the beginning
+    is skipped, an empty cell is called by its number, like `column1`, and a name that repeats gets
+    a number, like `X.2`. Raises UnreadableError if there are neither names nor a header.
 
     top : the lines from the first to the first row of samples. header : the number of the header's
     line, 0 for none. form : the section `[text]`.
@@ -170,10 +172,10 @@ def _read_plain(
 ) -> Table | None:
     """Return the table with its columns, read by pandas; None if the file is not plain.
 
-    Not plain are a row with a wrong number of cells, an empty line, an empty last cell, and a cell
-    with a line break; nor is a file of which `form.drop` leaves out lines. If a number means a lost
-    sample, all columns have texts. A column of True and False has bools; any other that pandas does
-    not read as numbers has texts.
+    A file is not plain if a row has a wrong number of cells, a line or a last cell is empty, a cell
+    has a line break, or `form.drop` is not empty, whatever lines it names. If a word of
+    `form.missing` ends in a digit, all columns have texts. A column of True and False has bools;
+    any other that pandas does not read as numbers has texts.
 
     table : has the names of the columns, which are empty, and the lines of the rows. words : the
     columns whose cells are read as texts; None: all.
