@@ -24,7 +24,7 @@ PASSWORD = re.compile(
     r"\b(password|passwd|sslpassword)=('(\\.|[^'\\])*'|\"[^\"]*\"|[^&\s'\"]+)", re.IGNORECASE
 )
 QUOTES = ("'", '"')
-OPTIONS = "channels?|fit|samples|rate_hz|unit|trigger"
+OPTIONS = "channels?|fit|samples|rate_hz|unit|trigger|alpha|lower_bound|guarantee|stops|audit_rate"
 OPTION = re.compile(
     rf"(?<![\w=])'[^']*'|(?<!:)\b({OPTIONS})=('[^']*'|\"[^\"]*\"|[\w.]+)|(?<=\()({OPTIONS})=?(?=\))"
 )
@@ -71,12 +71,12 @@ def as_options(text: str) -> str:
     """Return a message in which Python's arguments are written as options of the command line.
 
     `rate_hz=500` becomes `--rate-hz 500`, and a name alone in parentheses, `(samples)`, becomes
-    `(--samples)`. Only the names channel, channels, fit, samples, rate_hz, unit and trigger are
-    rewritten, and not after a colon. `TraceSpec(...)` around arguments is dropped, with a
-    `DataEngine(trace=...)` around it, also within quotes. A value in quotes loses them unless a
-    shell needs them. A value that begins neither with a quote nor with a letter, a digit, `_` or a
-    point, like -1, stays with its name as it was. All other text stays, also text in single quotes,
-    which messages use for data, unless a letter, a digit, `_` or `=` stands before the quote.
+    `(--samples)`. Only the names in `OPTIONS` are rewritten, and not after a colon.
+    `TraceSpec(...)` around arguments is dropped, with a `DataEngine(trace=...)` around it, also
+    within quotes. A value in quotes loses them unless a shell needs them. A value that begins
+    neither with a quote nor with a letter, a digit, `_` or a point, like -1, stays with its name as
+    it was. All other text stays, also text in single quotes, which messages use for data, unless a
+    letter, a digit, `_` or `=` stands before the quote.
     """
 
     def to_option(match: re.Match[str]) -> str:

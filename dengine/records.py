@@ -39,7 +39,7 @@ def is_whole(value: Any, least: int, most: int) -> bool:
 def is_number(value: Any) -> bool:
     """Return whether a value is a real number, Python's or NumPy's, that a float can hold.
 
-    Infinities and NaN count as numbers; True, 10**400, complex numbers and texts do not.
+    Infinities and NaN count as numbers; True, 10**400, a Decimal, complex numbers and texts do not.
     """
     if not isinstance(value, Real) or isinstance(value, bool):
         return False

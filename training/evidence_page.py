@@ -582,14 +582,14 @@ def guarantee_lines(played: pd.DataFrame) -> list[str]:
         "The table shows `conv` if every bad accepted part stops the line and is known "
         '(`stops="all"`). `python training/evidence_guarantees.py` played its replays at commit '
         f"{commits}. {origin} An entry is: **net seconds** / certain decisions / share of the "
-        "accepted parts that were bad. At LB 95.8 %, that is 1 - 5 / 120, an accepted part costs "
-        "as much as its check. The two columns on the right are limits that no engine can reach: "
+        "accepted parts that were bad. LB 95.8 % is 1 - 5 / 120: if 5 of 120 accepted parts are "
+        "bad, accepting costs as much as checking. The two columns on the right need hindsight: "
         "the accept threshold and the reject threshold that save most were chosen afterwards, with "
         "all labels known. The first of the two columns applies the thresholds to the score that "
         "each part had when the guarantee `cost` decided on it. The second column "
         "applies them to the scores of a model that was trained beforehand on the whole set, with "
-        "cross-fitting: a copy of the model that was trained without the label of a part scores "
-        "this part. [guarantees.csv](guarantees.csv) has a row for each replay.",
+        "cross-fitting: each part is scored by a copy of the model that was trained without its "
+        "label. [guarantees.csv](guarantees.csv) has a row for each replay.",
         "",
         *table_lines(["set", "parts", *names], table),
     ]

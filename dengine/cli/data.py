@@ -276,7 +276,7 @@ def train(
     if description is not None:
         description = in_form_of(store, description)
     dataset = source.load(description)
-    recipe = choice.load_if_given()
+    recipe = choice.load_if_given(store)
     try:
         with interruptible_steps(f"importing {dataset.name}", len(dataset)) as count:
             imported = import_labelled(store, dataset, recipe, seed, count, allow_import)

@@ -20,9 +20,8 @@ from .output import Record, format_size, print_result
     "--format",
     "form",
     type=click.Choice(["torchscript", "onnx"]),
-    default="torchscript",
-    show_default=True,
-    help="torchscript decides, audits and learns in the cell; onnx only decides.",
+    help="torchscript decides, audits and learns in the cell; onnx only decides.  [default: onnx "
+    "for a FILE.onnx, else torchscript]",
 )
 @click.option(
     "--key",
@@ -52,7 +51,7 @@ from .output import Record, format_size, print_result
 def export(
     store: str | None,
     out: Path | None,
-    form: str,
+    form: str | None,
     key: Path | None,
     new_key: Path | None,
     cpp: Path | None,
@@ -97,6 +96,7 @@ def export(
         record["cpp"] = export_sources(cpp)
         lines.append(f"Wrote {cpp}; build it as {cpp / 'CMakeLists.txt'} says.")
     if store is not None and out is not None:
+        form = form or ("onnx" if out.suffix == ".onnx" else "torchscript")
         exporter = export_onnx if form == "onnx" else export_torchscript
         # Read-only: the cell may run meanwhile.
         with DataEngine.open(store, reading=True, allow_import=allow_import) as engine:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Callable, Iterable, Mapping
-from contextlib import suppress
+from contextlib import closing, suppress
 from dataclasses import dataclass, replace
 from functools import wraps
 from importlib.util import find_spec
@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, get_args
 
 import click
 
-from ..errors import SettingError, as_options
+from ..errors import SettingError, StoreError, as_options
 from .output import Out, as_json, json_option, progress_bar
 
 if TYPE_CHECKING:
@@ -288,12 +288,35 @@ class RecipeChoice:
     name: str | None
     settings: Options
 
-    def load_if_given(self) -> Recipe | None:
+    def load_if_given(self, store: str | None) -> Recipe | None:
         """Return the recipe if a name or a setting was given; None means the store's own recipe.
 
-        The recipe is conv if only settings were given. Raises SettingError like `make_contender`.
+        It is what `make_contender` makes. But if `store` was used, and the name is that of its
+        reducer or was not given, it is the store's recipe with the settings that were given: the
+        others need no agreement. A store that is missing or cannot be opened is taken for new.
+        Raises SettingError like `make_contender`, and if the stored recipe cannot be read.
         """
-        return self.make_contender().recipe if self.name or self.settings else None
+        from ..recipe import Recipe
+        from ..store.opening import open_store
+
+        if not (self.name or self.settings):
+            return None
+        recipe = self.make_contender().recipe
+        texts: Mapping[str, str] = {}
+        if store:
+            with suppress(StoreError), closing(open_store(store, must_exist=True)) as opened:
+                texts = opened.settings.read()
+        if "recipe" in texts:
+            stored = Recipe.from_store(texts)
+            if self.name in (None, stored.reducer):
+                recipe = self._with_settings(stored)
+        return recipe
+
+    def _with_settings(self, recipe: Recipe) -> Recipe:
+        """Return a recipe with the settings that were given; SettingError for one out of range."""
+        policy = {name: value for name, value in self.settings.items() if name != "novelty"}
+        recipe = recipe.with_policy(**policy)
+        return recipe.with_settings(novelty=self.settings.get("novelty"))
 
     def make_contender(self) -> Contender:
         """Return the `Contender` that a replay runs: a recipe or a baseline, with its name.
@@ -313,9 +336,7 @@ class RecipeChoice:
 
         name = self.name or "conv"
         contender = Contender.load(name)
-        policy = {name: value for name, value in self.settings.items() if name != "novelty"}
-        recipe = contender.recipe.with_policy(**policy)
-        recipe = recipe.with_settings(novelty=self.settings.get("novelty"))
+        recipe = self._with_settings(contender.recipe)
         if recipe.reducer not in REDUCERS:
             reducer_class(recipe.reducer)
         return replace(contender, name=short_name(name), recipe=recipe)
@@ -494,9 +515,12 @@ class DataChoice:
             none is saved, if it has a `?`, or if a stated key is unknown or its value has the wrong
             type.
         SettingError
-            If `windows.trigger` of the description is malformed.
+            If `windows.trigger` of the description is malformed, or `--channels` is given for a
+            data set of which `Dataset.spec` cannot be made.
         StoreError
             If the data set is a store that cannot be opened or read.
+        Exception
+            What pandas raises for a damaged Parquet file of a table of `Dataset.to_frame`.
         """
         from ..datasets import load_dataset
         from ..datasets.read.files import as_source, find_files

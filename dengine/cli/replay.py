@@ -434,7 +434,7 @@ CAPTION = (
     "dearer beyond chance. All shuffles play the same parts: only parts that are recorded later "
     "are a clean test."
 )
-COLUMNS = ("", "rule", "LB", "cost", "late", "verified", "bad of\naccepted", "good of\nrejected")
+COLUMNS = ("rule", "LB", "cost", "late", "verified", "bad of\naccepted", "good of\nrejected")
 CURVE_FIELDS = (
     "recipe",
     "verdict",
@@ -541,7 +541,8 @@ def costs(
         _end(error, "too little was finished; there is nothing to show.", False)
         return
     check = amount(curve.costs.check)
-    verify_all = ("" if curve.policy else ">", "check all", "-", check, check, "100 %", "-", "-")
+    name = f"{'' if curve.policy else '> '}check all"
+    verify_all = (name, "-", check, check, "100 %", "-", "-")
     rows = [verify_all, *(_cost_cells(row, row.policy == curve.policy) for row in curve.rows)]
     title = f"{curve.recipe} on {curve.dataset}: what a part costs, in {cost_unit}"
     lines = _curve_lines(curve, dataset)
@@ -616,17 +617,17 @@ def _as_flags(settings: Options) -> str:
 def _cost_cells(row: PolicyCost, is_chosen: bool) -> tuple[str, ...]:
     """Return the cells of a policy's row in the table of costs, under the titles in `COLUMNS`.
 
-    The first is ">" if the policy is chosen, else "". The others are its rule (like "alpha 0.1" if
-    its guarantee is local, else the name of the guarantee), LB, its lower bound ("-" if its
-    guarantee is cost), cost with its interval in a second line, late cost (over the last third of
+    They are its rule (like "alpha 0.1" if its guarantee is local, else the name of the guarantee;
+    "> " stands before it if the policy is chosen), LB, its lower bound ("-" if its guarantee is
+    cost), cost with its interval in a second line, late cost (over the last third of
     each shuffle), share of verified parts, and wrong accepts and rejects with the intervals of
     their shares.
     """
     policy = row.policy
     is_local = policy.guarantee == "local"
+    rule = f"alpha {policy.alpha:g}" if is_local else policy.guarantee
     return (
-        ">" if is_chosen else "",
-        f"alpha {policy.alpha:g}" if is_local else policy.guarantee,
+        f"> {rule}" if is_chosen else rule,
         "-" if policy.guarantee == "cost" else percent(policy.lower_bound, "g"),
         f"{amount(row.cost)}\n{amount(row.lower)} to {amount(row.upper)}",
         amount(row.late),
@@ -638,12 +639,12 @@ def _cost_cells(row: PolicyCost, is_chosen: bool) -> tuple[str, ...]:
 
 def _error_cell(error: ErrorRate) -> str:
     """Return how many decisions were wrong, like "3 of 120", and in a second line the interval of
-    their share in percent, like "0.5 to 7.1 %".
+    their share in percent, like "0.5–7.1 %".
 
     The ends of the interval have at most three significant digits. The text is "-" if there was no
     decision.
     """
     if not error.decided:
         return "-"
-    interval = f"{amount(100 * error.lower)} to {amount(100 * error.upper)} %"
+    interval = f"{amount(100 * error.lower)}–{amount(100 * error.upper)} %"
     return f"{error.wrong} of {error.decided}\n{interval}"

@@ -106,7 +106,7 @@ def run(
     from ..engine.settings import agreed_trace_spec
     from ..store.opening import opening
 
-    recipe = choice.load_if_given()
+    recipe = choice.load_if_given(store)
     spec, make_cell = CELLS[kind](cycles=cycles, **cell_settings)
     with opening(store) as opened_store:
         opened = DataEngine.open_or_create(

@@ -147,7 +147,7 @@ def serve(
     from ..serve.demo import POLICY, playing
     from ..serve.server import serve as serve_cell
 
-    recipe = choice.load_if_given()
+    recipe = choice.load_if_given(store)
     trace: TraceSpec | None = None
     beside = []
     recorder: Any = nullcontext

@@ -506,10 +506,10 @@ def _made(kind: Any, value: Any, where: str) -> Any:
     """Return a value of a TOML file, converted to `kind`, the annotated type of its key.
 
     A table becomes a dataclass or a dict, and a list a tuple; so does a single value if several are
-    expected. `?` may stand in place of a text, number, boolean or choice, and the key `?` of a
-    mapping is left out. A single value in place of a `Channel` is its unit. Raises DataError for an
-    unknown key or choice, and for a value of another type (see `_as_kind`); `where` is its name in
-    the message.
+    expected. `?` (not known yet) may stand in place of a text, number, boolean or choice, and
+    stays `?`; the key `?` of a mapping is left out. A single value in place of a `Channel` is its
+    unit. Raises DataError for an unknown key or choice, and for a value of another type (see
+    `_as_kind`); `where` is its name in the message.
     """
     origin = get_origin(kind)
     args = get_args(kind)

@@ -338,7 +338,7 @@ class Certificate:
         all parts were checked. With prices the last sentence says when accepting pauses.
         """
         unknown = (
-            "silence is no success: set audit_rate, or stops='all' where every bad part stops the "
+            "silence is no success: set an audit rate, or stops to all if every bad part stops the "
             "system"
         )
         which = "that went on without a check"

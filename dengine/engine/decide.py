@@ -168,7 +168,8 @@ class DecisionMaker:
         part : str or None
             Number of the part.
         decision_id : str, optional
-            An id that the caller chose; None: a new one.
+            An id that the caller chose, and that has no decision yet (`find_earlier`); None: a new
+            one.
         verify_reason : Reason, optional
             Verify for this reason, without asking the model and without checking the force limits.
             If the store is damaged or its journal cannot be written, `Reason.NO_STORE` takes its
@@ -315,8 +316,8 @@ def _verify(x: TraceArray, conditions: DecisionConditions, reason: Reason) -> Ve
 def check_same_trace(stored: StoredDecision, trace: Any, spec: TraceSpec | None) -> Decision:
     """Return the decision of a record, if `trace` is the trace that it was made on.
 
-    The samples must be equal as float32, after the trace was converted as `spec` demands
-    (`as_trace`); a NaN equals a NaN.
+    `stored` must have its trace. The samples must be equal as float32, after the trace was
+    converted as `spec` demands (`as_trace`); a NaN equals a NaN.
 
     Raises
     ------

@@ -148,7 +148,7 @@ class Learner:
         """Give labels the numbers that the store assigned, and put the rule right if it must be.
 
         The store assigns numbers only in a product (cells that share labels and versions). Checks
-        that have become overdue are counted, too. The rule must be put right (`Feedback.remedy`)
+        whose report is overdue count as wrong, too. The rule must be put right (`Feedback.remedy`)
         after it learned a wrong outcome: it is rebuilt, or all corrections that the store has by
         now are applied and it is rebuilt. This waits for a later call while the store lacks any
         record or has a fault. Before a correction a retrain under way is ended (`end_training`),

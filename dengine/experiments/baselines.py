@@ -308,13 +308,14 @@ def make_baseline(name: str, policy: Policy, seed: int = 0, **params: Any) -> Ba
     Parameters
     ----------
     name : str
-        A name in `BASELINES`, or `module:Class` of a subclass of `Baseline`.
+        A name in `BASELINES`, or `module:Class` of a subclass of `Baseline`, which is imported.
     policy : Policy
         Its alpha and lower_bound are the baseline's; the rest belongs to the engine.
     seed : int, default 0
         Of everything drawn.
     **params
-        The baseline's own settings; those left out have the defaults of its class.
+        The baseline's own settings, the keyword-only fields of its dataclass; those left out have
+        their defaults.
 
     Raises
     ------

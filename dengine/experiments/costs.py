@@ -197,7 +197,7 @@ class CostCurve:
         without any recordings would show it. In production only the audited share of the parts
         counts: each part if the policy has stops "all"; 5 % (`AUDIT_RATE`) if it has no audits. It
         is assumed that the shares of wrong decisions stay as they were seen. None if the verdict is
-        another, or if 10,000 times the parts of a shuffle are too few.
+        another, or if 10,000 times the parts of a shuffle, a replay in random order, are too few.
         """
         row = self.marked
         if self.verdict != "may pay":
@@ -402,10 +402,11 @@ def needed_parts(policy: Policy) -> int:
     """Return the least number of good parts that a policy needs before it can accept a part.
 
     For the guarantee "local" this is the number of good labels within the radius, without a bad
-    one, that puts the lower end of the policy's interval at LB: z^2 LB / (1 - LB), rounded up, with
-    Wilson's interval; it is 10,000,000 if more are needed. For "pooled" it is the number of checked
-    parts, all good, that give enough evidence at error level alpha; their scores must reach a level
-    that may become the accept threshold. For other guarantees it is 0.
+    one, that puts the lower end of the policy's interval at LB (`Policy.lower_bound`): z^2 LB /
+    (1 - LB), rounded up, with Wilson's interval; it is 10,000,000 if more are needed. For "pooled"
+    it is the number of checked parts, all good, that give enough evidence at error level alpha;
+    their scores must reach one of the levels that the rule may take as accept threshold. For other
+    guarantees it is 0.
     """
     if policy.guarantee == "local":
         counts = range(1, MOST_NEIGHBOURS)

@@ -259,7 +259,7 @@ def compare_points(decider: Decider, X: Floats, points: Floats) -> str:
         Compiled or not. It decides on each trace as on a trace of an unknown part.
     X : array of float32, shape (n, C, T)
     points : array of float32, shape (n, K, d)
-        The scaled embeddings that the reducer gives.
+        The scaled embeddings that the reducer gives, one in each of its K spaces.
 
     Returns
     -------

@@ -481,11 +481,11 @@ class RocketReducer(ProbabilityReducer):
         """Compute feature scales and principal components anew from unscaled features (n, P).
 
         At most 1000 rows of `raw`, evenly spaced, are read; `n_component_traces_` becomes n.
-        `towers_` gets a new `Tower` for each group of features, whose heads are the ones nearest to
-        the old heads, or 0 if there are none, and a last one for the products of the leading
-        components, whose heads are 0. Scales, leading components and, if `n_components` is 2, the
-        second axis of the embedding are written to `net_`; the heads are not: call `_set_heads`
-        before `net_` is used.
+        `towers_` gets a new `Tower` for each group of features, whose classifier heads are the ones
+        nearest to the old heads, or 0 if there are none, and a last one for the products of the
+        leading components, whose heads are 0. Scales, leading components and, if `n_components` is
+        2, the second axis of the embedding are written to `net_`; the heads are not: call
+        `_set_heads` before `net_` is used.
         """
         net = self.net_
         encoder = net.encoder

@@ -59,7 +59,7 @@ PROBLEM = "application/problem+json"
 RETRY_SECONDS = 1
 NO_ROUTE = {
     404: "Expected one of the paths in /openapi.json, got another.",
-    405: "Expected another method on this path.",
+    405: "Expected a method that /openapi.json lists for this path, got another.",
 }
 STRINGS = re.compile(rb'"(?:[^"\\]|\\.)*+"(\s*:)?')  # in JSON; a key is followed by a colon
 REF = "#/components/schemas/{name}"

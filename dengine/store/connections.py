@@ -244,8 +244,8 @@ def reading(url: str) -> Iterator[sa.Connection]:
         file = str(engine.url.database)
         if sqlite and not Path(file).is_file():
             raise StoreError(
-                f"Expected a store that an engine has used, found no file {file}; make a "
-                "DataEngine with it, or let `dengine train` or `dengine run` make one."
+                f"Expected a store, or a copy that `dengine backup` made, found no file {file}; "
+                "`dengine train`, `dengine run` and DataEngine make a store."
             )
         with _store_errors("read", name), engine.connect() as connection:  # rolled back at the end
             connection.execution_options(**options)
@@ -388,10 +388,10 @@ class Database:
 
         After the block an entry for the rows that it added is inserted into the ledger, the cell's
         hash chain, and both are committed. Then `newest_entry` becomes number and digest of this
-        entry, and `on_entry`, a function that the outbox has set, is called. If the block added no
-        rows and changed no settings, there is no entry. On an error everything is rolled back.
-        Errors of the database, and OSError, ValueError, TypeError and OverflowError, become
-        StoreError; dengine's own errors and all others pass unchanged.
+        entry, and `on_entry`, set by the outbox (through which an engine records), is called. If
+        the block added no rows and changed no settings, there is no entry. On an error everything
+        is rolled back. Errors of the database, and OSError, ValueError, TypeError and
+        OverflowError, become StoreError; dengine's own errors and all others pass unchanged.
 
         StoreError is raised, too, if the function given to `commit_if` returns False, and if the
         SQLite file was replaced. If this is noticed only after the commit, the rows are in the

@@ -308,7 +308,7 @@ class DecisionTable(CellTable):
         seconds : float, default 0.0
             Length of a period of time; 0.0: the stretches are runs of decisions.
         start : float, default 0.0
-            A time, in seconds since 1970, at which a period begins.
+            A time, in seconds since 1970, at which a period begins; earlier decisions count, too.
 
         Returns
         -------

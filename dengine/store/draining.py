@@ -313,9 +313,10 @@ class Drainer:
         event, which is also logged. Then the journal's header notes that the database has the
         records (if it cannot be written, that is ignored), `n_drained` counts them, and they leave
         the queue of the recorder and, except for the newest decisions, the `DecisionIndex`, by
-        which decisions are found in memory. In a product the numbers of their labels are kept for
-        `pop_label_numbers`. Raise StoreError if the database fails; nothing of this is done then,
-        and the next call commits the same records again, of which some may be stored already.
+        which decisions are found in memory. In a product (cells that share labels and versions) the
+        numbers of their labels are kept for `pop_label_numbers`. Raise StoreError if the database
+        fails; nothing of this is done then, and the next call commits the same records again, of
+        which some may be stored already.
         """
         with self._changed:
             chunk = list(islice(self._recorder.synced, CHUNK))

@@ -266,11 +266,12 @@ class Journal:
         return False
 
     def undrained_records(self) -> Iterator[tuple[int, int, bytes]]:
-        """Yield (offset, end, encoded record) of the records that the store lacks, oldest first.
+        """Yield (offset, end, encoded record) of the records from `drained_to` on, oldest first.
 
-        A record takes the bytes of the file from `offset` to before `end`. Damaged records are
-        skipped: the search goes on at the next mark (`MARK`, four bytes with which each record
-        begins), and the digest that chains a record to the one before is not checked. Raise
+        The store lacks them; but if the header is older than the store, as after a crash, it has
+        some of them. A record takes the bytes of the file from `offset` to before `end`. Damaged
+        records are skipped: the search goes on at the next mark (`MARK`, four bytes with which each
+        record begins), and the digest that chains a record to the one before is not checked. Raise
         OSError, and no StoreError, if the disk cannot be read.
         """
         begin = self.drained_to

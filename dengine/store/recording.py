@@ -227,9 +227,10 @@ class Recorder:
     def _write(self, batch: Sequence[Entry]) -> None:
         """Append a batch of records to the journal, sync it, move them to the queue `synced`.
 
-        They are the oldest of the queue `unwritten`, and leave it; then the last error is cleared.
-        A journal of more than 8 MiB is cleared first, if the `Drainer` copies its last records to
-        the database within BATCH_SECONDS (0.05 s). If the journal's file was deleted, moved or
+        They are the oldest of the queue `unwritten`, and leave it. Each gets its `offset` and
+        `end`, the last error is cleared, and threads that wait for `changed` are woken. A journal
+        of more than 8 MiB is cleared first, if the `Drainer` copies its last records to the
+        database within BATCH_SECONDS (0.05 s). If the journal's file was deleted, moved or
         replaced, it is created again, which is logged, and an event says so. Raise StoreError if
         the disk fails, or that file cannot be created; the entries then stay in `unwritten`.
         """

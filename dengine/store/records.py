@@ -104,7 +104,7 @@ def already_reported(
     if first[0] is None:
         advice = "if it is to count again, correct it"
     elif first[0] != second[0]:
-        advice = "if the first was wrong, look at how the part was checked"
+        advice = "if the first was wrong, correct it"
     return ReportConflictError(
         f"Expected one report a decision, got a second on {decision_id!r}: {stored} was reported "
         f"first and stands, now came {new}; {advice}."

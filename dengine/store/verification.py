@@ -144,15 +144,16 @@ def verify_history(
     """Check every row of a store's history; no row is changed, and engines may run meanwhile.
 
     What is wrong is returned as faults, not raised: a row or setting that was changed, added or
-    removed, a decision without its trace or a trace or label without its decision, a damaged SQLite
-    file, damaged or missing records of a journal, a ledger entry that a cell's journal names and
-    the store lacks, a cell that no engine has opened, lost data that nobody has acknowledged (an
-    event says so), and an `expect` that no entry of the checked cells has. At most 20 missing
-    ledger entries of a cell, and 100 findings of SQLite, are returned. A journal that is missing or
-    cannot be read is no fault: `waiting` of the cell is None then. A change of the setting
-    `product`, by which cells share what they learn, is not noticed. The SQLite file of a store that
-    was not in WAL mode is set to it. Takes 40 bytes of memory per row of all cells, the same again
-    for the rows of the cell at hand, and the memory of its ledger entries.
+    removed, a decision without its trace or a trace or label without its decision, a table that
+    cannot be read to its end (the cell's decisions, traces and labels are then not compared), a
+    damaged SQLite file, damaged or missing records of a journal, a ledger entry that a cell's
+    journal names and the store lacks, a cell that no engine has opened, lost data that nobody has
+    acknowledged (an event says so), and an `expect` that no entry of the checked cells has. At most
+    20 missing ledger entries of a cell, and 100 findings of SQLite, are returned. A journal that is
+    missing or cannot be read is no fault: `waiting` of the cell is None then. A change of the
+    setting `product`, by which cells share what they learn, is not noticed. The SQLite file of a
+    store that was not in WAL mode is set to it. Takes 40 bytes of memory per row of all cells, the
+    same again for the rows of the cell at hand, and the memory of its ledger entries.
 
     Parameters
     ----------

@@ -168,11 +168,12 @@ class Tally:
     def outcomes(self) -> Outcomes:
         """Counts of parts by action and corrected label, for the certificate (an error bound).
 
-        An audited part is counted by what the model alone would have done, in the fields of audits
-        alone and not among the accepted and rejected parts: `audited_accepts` and `audited_rejects`
-        are the audits with the label good or bad. Audits with the label forgotten or overdue have
-        fields of their own, and audits with the label none are in no field. A part that an
-        operator's limits rejected (`Reason.OUTSIDE`) is not counted as rejected or false reject.
+        An audited part (checked though the model was certain) is counted by what the model alone
+        would have done, in the fields of audits alone and not among the accepted and rejected
+        parts: `audited_accepts` and `audited_rejects` are the audits with the label good or bad.
+        Audits with the label forgotten (withdrawn) or overdue (not reported in time) have fields of
+        their own, and audits with the label none are in no field. A part that an operator's limits
+        rejected (`Reason.OUTSIDE`) is not counted as rejected or false reject.
         """
         actions = Counter[Action]()
         by_action = Counter[tuple[Action, str]]()

@@ -14,7 +14,7 @@ import pytest
 
 from dengine import DataEngine, Dataset, backup_store, load_dataset
 from dengine.cli import main
-from dengine.cli.output import INTERRUPTED
+from dengine.cli.output import INTERRUPTED, print_parts, table_of_rows
 from dengine.datasets import importing
 from dengine.datasets.importing import import_labelled
 from dengine.engine.trainer import Retrainer
@@ -177,7 +177,10 @@ def test_run_verifies_less_in_the_end_and_resumes_after_its_last_part(data, tmp_
     assert shares[0] == 1.0 > shares[-1]
     assert (tmp_path / "run.png").is_file()
     assert n_rows(tmp_path / "run.csv") == 110
-    assert "resumed" in document(*words, "--cycles", 30)["title"]
+    assert "resumed" in document(*words, "--reducer", "pca", "--cycles", 30)["title"]
+    other = dengine(*words, "--alpha", 0.01)
+    assert other.exit_code == 1
+    assert "got alpha 0.01; leave them out" in other.stderr  # only what was typed
     with DataEngine.open(store) as engine:
         assert engine.status().ever.decisions == 140
         hashes = engine.store.labels.with_traces().hashes.tolist()
@@ -185,6 +188,14 @@ def test_run_verifies_less_in_the_end_and_resumes_after_its_last_part(data, tmp_
     more = dengine(*words, "--cycles", 60)
     assert more.exit_code == 1
     assert re.search(r"at most 2\d cycles, got 60", more.stderr)
+
+
+def test_a_table_prints_every_text_as_it_is_and_cuts_none(capsys):
+    long = "x" * 200
+    print_parts(table_of_rows("old [1] [/red]", [["0:100::60", long], [long, "0:100::60"]]))
+    printed = capsys.readouterr().out
+    assert "old [1] [/red]" in printed
+    assert (printed.count("0:100::60"), printed.count("x")) == (2, 400)
 
 
 FAILING = """status missing.db; replay --data missing.npz; replay --recipe missing.toml --data DATA; data DATA --set traces.samples=x

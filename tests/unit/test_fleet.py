@@ -9,13 +9,15 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from itertools import count
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 import sqlalchemy as sa
 from sklearn.decomposition import PCA
 
-from dengine import DataEngine, Dataset, Recipe, SqlStore
+from dengine import DataEngine, Dataset, ModelPrediction, Recipe, SqlStore
+from dengine.decision.scripting import incompatible_model_error
 from dengine.errors import SettingError, StoreError, TraceError
 from dengine.store import verify_history
 from dengine.store.peers import list_cells
@@ -317,18 +319,26 @@ def test_a_cell_without_news_goes_on_and_says_so_once(
     must_be_as(fleet, second, probe)
 
 
-def test_a_peers_version_that_is_damaged_is_left_out_and_the_next_one_answers(fleet, parts, caplog):
+@pytest.mark.parametrize("is_damaged", [True, False], ids=["damaged", "of another model"])
+def test_a_peers_version_that_is_of_no_use_is_left_out_and_the_next_one_answers(
+    is_damaged, fleet, parts, caplog, monkeypatch
+):
     first, second = taught(fleet, parts, 60)
     version = second.version
     first.retrain()
     first.flush()
     spoiled = sa.update(VERSION).where(VERSION.c.version == first.version).values(state=b"nothing")
-    with first.store.database._engine.begin() as connection:
-        connection.execute(spoiled)
-    for _ in range(3):
-        second.poll()
+    with monkeypatch.context() as patch:
+        if is_damaged:
+            with first.store.database._engine.begin() as connection:
+                connection.execute(spoiled)
+        else:  # as another release would say
+            error = incompatible_model_error("encoder has other sizes")
+            patch.setattr(ModelPrediction, "set_state", Mock(side_effect=error))
+        for _ in range(3):
+            second.poll()
     assert (second.version, caplog.text.count("cannot be used")) == (version, 1)
-    share(first, second)
+    share(second, first)
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ import json
 
 import pandas as pd
 
-STREAMS = "| stream | certain | accepted | of these bad | rejected | of these good |\n"
+STREAMS = "| stream | certain | accepted | bad accepted | rejected | good rejected |\n"
 FIGURES = "{certain:.0f} {accepted:.0f} {false_positive:.1f} {rejected:.0f} {false_negative:.1f}"
 
 

@@ -47,6 +47,7 @@ YEARS = (946_684_800, 2_524_608_000)  # seconds since 1970 of the years 2000 to 
 SECONDS = (2e-4, 0.019)
 EVEN = 0.01  # by which equal steps may differ, as a share of them
 FEW = 0.1  # of the recordings that may have a gap, and of the steps that may fall
+SHORT = 0.01  # of the recordings that may end before `traces.samples`, with `resample`
 ANSWERS = (  # to a clock that the reader would refuse
     "state the longest time.gap (0: any; with traces.lengths=resample if the clock jitters), or "
     "time.wrap of a counter that begins again, another time.column, or none, [], and time.rate_hz"
@@ -100,13 +101,13 @@ def is_clock(column: Column) -> bool:
 
 
 def is_counter(column: Column) -> bool:
-    """Return whether a column that is not named like a clock may count samples or tell the time.
+    """Return whether a column that is not named like a clock may tell the time all the same.
 
-    The steps from row to row (`Column.steps`) decide. For a column that is named like a counter
-    (`index`, `sample`, `n`, ...) the result is True if any step differs by more than 1 % from the
-    median step. For any other column it is True if no step does and the median is neither 0 nor 1;
-    but it is False if the column is named like a force, has a unit of a quantity that is not time,
-    or is named like `x*`, the samples of a wide table.
+    A mere numbering of the rows does not. The steps from row to row (`Column.steps`) decide. For a
+    column that is named like a counter (`index`, `sample`, `n`, ...) the result is True if any step
+    differs by more than 1 % from the median step. For any other column it is True if no step does
+    and the median is neither 0 nor 1; but it is False if the column is named like a force, has a
+    unit of a quantity that is not time, or is named like `x*`, the samples of a wide table.
     """
     steps = column.steps
     usual = float(np.median(steps)) if len(steps) else 0.0
@@ -194,7 +195,9 @@ def propose_rate(p: Proposal, tables: Tables) -> None:
     a note, if it is not between 1 Hz and 1 MHz, like that of times that only fall; then `time.gap`,
     the longest step that is allowed, is not looked at. Otherwise `check_steps` checks the times, by
     the rate and the gap that the description has by then. If it refuses more recordings than 10 %
-    plus one, `time.gap` is set to `?`, with a note on the first. If all recordings start after 1999
+    plus one, `time.gap` is set to `?`, with a note on the first. If `traces.lengths` is stated as
+    `resample`, `traces.samples` becomes as many as 99 % of the recordings last; longer ones lose
+    their end when they are read. If all recordings start after 1999
     (UTC), `order` is set to `time`, also if the rate is `?`. Recordings whose times cannot be read
     are skipped. Stated keys stay. Raises DataError if a stated format is no form or unit of times,
     or if a setting in `[time]` is wrong (see `check_forms`).
@@ -221,6 +224,10 @@ def propose_rate(p: Proposal, tables: Tables) -> None:
         p.put("time.rate_hz", UNKNOWN, text)
         return
     p.put("time.rate_hz", float(f"{1 / usual:.5g}"))
+    if p.description.traces.lengths == "resample":
+        spans = [seconds[-1] - seconds[0] for _, seconds in clocks]
+        n_steps = np.ceil(np.quantile(spans, SHORT) * p.description.time.rate_hz - EVEN)
+        p.put("traces.samples", int(n_steps) + 1)
     faults = list[Fault]()
     for table, seconds in clocks:
         with caught(faults, table.source):

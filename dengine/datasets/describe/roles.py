@@ -213,8 +213,9 @@ def propose_channels(p: Proposal, units: Mapping[str, str]) -> None:
     along z, a name like a force, a unit of force or torque, a name like `F` or `value`, any column.
     A name decides only if the unit is that of a force or torque, or unknown. The channels stay
     empty, with a note, if `units` is empty, if several columns fit the rule, if the column that
-    fits has no unit of force or torque and another column has one, if `_doubt_on` has a reason
-    against a column, or if `_other_scales` yields a text. Raises SettingError for a malformed
+    fits has no unit of force or torque and another column has one, if one of these columns is named
+    like a set value or a limit, or is numbered unevenly (`_doubt_on`), or if a unit, factor or rate
+    differs between recordings (`_other_scales`). Raises SettingError for a malformed
     `windows.trigger`.
 
     units : the columns that may be channels, with their units, "" for unknown.
@@ -322,14 +323,14 @@ def find_lost(p: Proposal) -> None:
 
 
 def propose_lengths(p: Proposal) -> None:
-    """Set `traces.samples` in `p` to the median length of the recordings, rounded down.
+    """Set `traces.samples` in `p`, if it is 0, to the median length of the recordings.
 
-    The length is that of the first channel; without one nothing is set. Recordings without rows are
-    ignored; if all are, the length is 0. If some have another length, and `traces.lengths` is not
-    stated, a note counts them, and `traces.lengths` becomes `pad` if they are more than 10 % of the
-    recordings, else `strict`. A stated `traces.samples` stays. Unless it is stated, another note
-    counts the recordings that end with two zeros or more, if they are more than 10 %: the zeros may
-    fill up shorter recordings.
+    It is rounded down. The length is that of the first channel; without one nothing is set.
+    Recordings without rows are ignored; if all are, the length is 0. If some have another length,
+    and `traces.lengths` is not stated, a note counts them, and `traces.lengths` becomes `pad` if
+    they are more than 10 % of the recordings, else `strict`. A stated `traces.samples` stays.
+    Unless it is stated, another note counts the recordings that end with two zeros or more, if they
+    are more than 10 %: the zeros may fill up shorter recordings.
     """
     if p.description.channels:
         column = p.columns[next(iter(p.description.channels))]
@@ -345,6 +346,7 @@ def propose_lengths(p: Proposal) -> None:
             p.put("traces.lengths", "strict" if is_few else "pad", text)
         n_filled = sum(np.array_equal(x[-2:], [0, 0]) for x in column.numbers)
         note = f"{n_filled} recordings end with several zeros: are these samples?"
+        usual = p.description.traces.samples or usual
         p.put("traces.samples", usual, note if n_filled > SPARSE * len(lengths) else "")
 
 

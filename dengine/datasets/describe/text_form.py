@@ -187,10 +187,11 @@ def propose_form(p: Proposal, contents: Mapping[str, bytes], faults: list[Fault]
     Files with another delimiter, number of columns or header are left out: they move from `p.names`
     to `p.others`. If two or more of them have at least 8 rows of samples, or if a single one has,
     and its name differs by a number only from that of a file in the result, `exclude` is set to
-    `?`, with a note that asks whether they are recordings. For a file that is no text, or whose
-    header is not certain, a fault is appended to `faults`, and it stays in `p.names`; if all are
-    such, nothing is set, and the result is empty. Of equally frequent forms the first counts.
-    Stated keys stay. Raises LookupError for a stated encoding that Python does not know.
+    `?` (the user must answer), with a note that asks whether they are recordings. For a file that
+    is no text, or whose header is not certain, a fault is appended to `faults`, and it stays in
+    `p.names`; if all are such, nothing is set, and the result is empty. Of equally frequent forms
+    the first counts. Keys that the user stated stay. Raises LookupError for a stated encoding that
+    Python does not know.
 
     contents : the contents of the files that are looked at, by name.
     """

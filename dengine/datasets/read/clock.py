@@ -55,17 +55,19 @@ def times_of(table: Table, clock: Clock, form: TextForm) -> Floats:
     microseconds.
 
     If times of day fall from one row to the next by more than half a day, midnight has passed,
-    unless a column of the clock has the date. If a counter falls by more than half of `clock.wrap`,
-    it began again at 0; with a `wrap` of 0 times may fall.
+    unless one of the clock's formats has the date. If a counter falls by more than half of
+    `clock.wrap`, it began again at 0; with a `wrap` of 0 times may fall.
 
     Parameters
     ----------
     table : Table
         The rows of a recording.
     clock : Clock
-        The section `[time]`, which has passed `check_forms`. The times in its columns are added up;
-        a column of one cell holds for all rows, and a column of datetimes needs no format. Without
-        columns there is one time, 0.
+        The section `[time]`, which has passed `check_forms`, with as many formats as columns. The
+        times in its columns are added up; a column of one cell holds for all rows. A column of
+        datetimes is read as `iso`, whatever its format; state `iso`, by which it is known to have
+        the date. Dates without a time zone are in `zone`. Without columns and formats there is one
+        time, 0.
     form : TextForm
         The section `[text]`: how numbers are written.
 

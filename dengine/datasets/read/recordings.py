@@ -341,6 +341,7 @@ def fitted(samples: Floats, seconds: Floats | None, description: Description) ->
     n = samples.shape[1]
     kind = FITS.index(about.lengths.removesuffix("-all"))
     can_fit = can_fit_length(n, about.samples, kind) or (about.lengths == "pad-all" and n > 0)
+    wanted, actual = f"{about.samples} samples", f"{n}"
     if about.lengths == "resample" and seconds is not None:
         seconds = seconds - seconds[0]
         times = np.linspace(0, seconds[-1], about.samples)
@@ -349,8 +350,10 @@ def fitted(samples: Floats, seconds: Floats | None, description: Description) ->
             can_fit = bool(times[-1] <= seconds[-1] + (1 + ROUNDING) / rate)
         if can_fit:
             return np.stack([np.interp(times, seconds, row) for row in samples]).astype(np.float32)
+        wanted += f" in {times[-1]:.4g} s"
+        actual += f" in {seconds[-1]:.4g} s"
     elif can_fit:
         return fit_length(torch.from_numpy(samples.astype(np.float32)), about.samples, kind).numpy()
     raise UnreadableError(
-        f"Expected {about.samples} samples, got {n}; see traces.lengths, which is {about.lengths}"
+        f"Expected {wanted}, got {actual}; see traces.lengths, which is {about.lengths}"
     )
