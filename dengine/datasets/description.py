@@ -322,10 +322,10 @@ class Description:
         Keys that are left out get their default values. Any key but `version` may have the value
         `?`, but a section may not. A channel named `?` is left out, and so is this name in `[rows]`
         and `[ignored]`. Of a channel, a text in place of a dict is its unit. A single value may
-        stand for a list of one, and a number or boolean for a text. `notes` are no key; the result
-        has none. Raises DataError for an unknown key or choice (the message names the most similar
-        key, or else all), for a value of the wrong type, for NaN or infinity in a key of floats,
-        and for a version that is newer or no integer.
+        stand for a list of one, and a number or boolean for a text. The result has no `notes`.
+        Raises DataError for an unknown key, such as `notes`, or choice (the message names the most
+        similar key, or else all), for a value of the wrong type, for NaN or infinity in a key of
+        floats, and for a version that is newer or no integer.
 
         where : what the description is called in errors.
         """

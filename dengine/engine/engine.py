@@ -510,9 +510,9 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         are test, store, put in force; in a product all are taken, after the other cells' news, and
         the call waits for the store), and accepted parts without a report are confirmed
         (`Policy(stops="all")`) or counted as unreported. A rule that lacks a correction is put
-        right, as by `flush`. Checks that become overdue update the rule. If a safe mode began or
-        ended, an event is recorded, and `on_safe_mode` is called. For an id that has a decision
-        nothing of this is done, and that decision is returned.
+        right, as by `flush`. After the decision, checks that have become overdue update the rule;
+        then, if a safe mode began or ended, an event is recorded, and `on_safe_mode` is called. For
+        an id that has a decision nothing of this is done, and that decision is returned.
 
         Parameters
         ----------
@@ -781,9 +781,9 @@ class DataEngine(AbstractContextManager["DataEngine"]):
             True: a version that is already trained is first put in force or dropped, and a training
             that is not done is discarded. With an executor the first such call also loads the
             modules that a retrain imports; if that fails, it is logged. False: begin to retrain in
-            the executor, and return None. If a retrain is under way, nothing is begun, and a
-            trained version is taken one step further (in a product, all steps); if the executor
-            cannot begin yet, `poll` or `report` begins it. `poll` brings it to its end.
+            the executor, and return None; `poll` brings it to its end. If a retrain is under way,
+            nothing is begun, and a trained version is taken one step further (in a product, all
+            steps); if the executor cannot begin yet, `poll` or `report` begins it.
             Without an executor, or if the executor takes no work because it died or hangs, the
             retrain runs in this thread, and its report is returned.
 
@@ -891,10 +891,14 @@ class DataEngine(AbstractContextManager["DataEngine"]):
     def certificate(self) -> Certificate:
         """Return bounds, at confidence 1 - alpha, on the errors of the decisions without a check.
 
-        Before that, everything is written to the disk, and to the store if it answers (`flush`);
-        what the store does not take in time does not count. Decisions since the last change of
-        policy count. With `stops="all"` accepted parts of unknown outcome are left out. A forgotten
-        label and an overdue audit count as wrong decisions. Raises NotTakenError if not everything
+        One is on the mean probability that an accepted part was bad, the other that a rejected part
+        was good. They follow from audits, random checks of parts of which the model was certain;
+        the first follows from the outcomes of the accepted parts if all are known. Without either a
+        bound is 1. Before that, everything is written to the disk, and to the store if it answers
+        (`flush`); what the store does not take in time does not count. Decisions since the last
+        change of policy count. With `stops="all"` (every bad accepted part is reported) accepted
+        parts of unknown outcome are left out. A forgotten (withdrawn) label and an overdue audit
+        (without a label in time) count as wrong decisions. Raises NotTakenError if not everything
         is on disk in time, and StoreError if the store cannot be read.
         """
         self.flush()

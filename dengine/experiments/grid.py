@@ -284,8 +284,10 @@ def iterate_replays(
         Replays at a time, as joblib counts them. Timings are right with 1 alone. 1 plays in this
         thread, which then has one torch thread.
     keep : path or None, default None
-        Folder of finished replays, made if it is missing: those in it are not played again, unless
-        their file is damaged, and others are added as they end.
+        Folder of finished replays, made if it is missing. A replay in it is not played again if
+        data, settings, seed, libraries and the code of dengine and of the reducer are the same
+        (`KeptReplays.path`), unless its file is damaged; others are added as they end. Other code
+        of yours, like that of a baseline, is not compared.
     on_cycle : callable or None, default None
         Called after each cycle with the number of finished cycles of its replay. It is not called
         if `n_jobs` is not 1, because a callback cannot travel to other processes.

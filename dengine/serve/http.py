@@ -240,12 +240,13 @@ class HttpApi:
         decision has no label, or no id is given (422), no label is forgotten. 422 also for a
         request without an author, unless the token has a name, and for an author that is not the
         token's, is longer than 200 characters or not printable. The certificate, which bounds the
-        errors of the decisions, goes on to count a forgotten outcome of a certain decision, as
-        wrong. In the reason each run of white space becomes a space. If a rollback pinned the
-        version in force, and this was trained with one of the labels, or one is older than all that
-        it was trained with, it is released, so that retrains may replace it. A training under way
-        begins again, even if the labels are forgotten already; no event is recorded then. 503: the
-        queue is full, the store does not answer, or the trace of a decision is damaged.
+        errors of the decisions, counts a forgotten outcome as wrong if the part was accepted, or
+        was checked though the model was certain. In the reason each run of white space becomes a
+        space. If a rollback pinned the version in force, and this was trained with one of the
+        labels, or one is older than all that it was trained with, it is released, so that retrains
+        may replace it. A training under way begins again, even if the labels are forgotten already;
+        no event is recorded then. 503: the queue is full, the store does not answer, or the trace
+        of a decision is damaged.
         """
         line = " ".join(reason.split())
         return await self._change(
@@ -434,9 +435,10 @@ class HttpApi:
     async def changes(self) -> Response:
         """Return a stream of server-sent events, which ends when the server ends.
 
-        The first is hello, with the server's version. Then comes changed, at once and whenever
-        decisions, reports, changes by hand (also refused ones) or retrains have come since the last
-        event, and tick after each 5 seconds without any. Nothing says what has changed.
+        The first is hello, with the server's version, and the second always changed. Then comes
+        changed whenever decisions, reports of outcomes, changes by hand (also refused ones) or
+        retrains have come since the last event, and tick after each 5 seconds without any. Nothing
+        says what has changed.
         """
 
         async def event_stream() -> AsyncIterator[str]:

@@ -513,7 +513,8 @@ def address(store: FilePath, cell_id: str | None = None, product: str | None = N
 
     A `CellAddress` is a text with the attributes `cell_id` and `product`. If only a product is
     given, or `cell_id` is "", the cell is named "cell". If neither is given, a `store` that is a
-    `CellAddress` already is returned unchanged; otherwise its own cell and product are replaced.
+    `CellAddress` already is returned unchanged; otherwise its own cell and product are both
+    dropped, even if only one is given.
     """
     url = os.fspath(store)
     return (

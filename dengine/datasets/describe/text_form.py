@@ -61,12 +61,13 @@ def look(content: bytes, stated: Stated) -> Look:
     Only its first 2 million characters are looked at. The result has the text form, the number of
     cells in a row, whether a delimiter ends each row (its last cell is then empty), the line of the
     header ("" for none) and the cells of each line from the first row of samples on, also of lines
-    of another form. The delimiter and the first row follow from the first 200 lines; of delimiters
-    with equal scores the one with more cells is taken. If none splits the usual line into cells,
-    there is a single column, and the delimiter is a semicolon, or the stated one. The marks in
-    numbers stay those of `TextForm`. `content` has the bytes of the file. Raises DataError if it is
-    empty or no text, or if the line of its header is not certain, and LookupError for a stated
-    encoding that Python does not know.
+    of another form. The delimiter, which is the one that best splits the lines into numbers, and
+    the first row follow from the first 200 lines; of equally good delimiters the one with more
+    cells is taken. If none splits the usual line into cells, there is a single column, and the
+    delimiter is a semicolon, or the stated one. The decimal mark and the mark of thousands are not
+    looked for: the text form has the defaults. `content` has the bytes of the file. Raises
+    DataError if it is empty or no text, or if the line of its header is not certain, and
+    LookupError for a stated encoding that Python does not know.
 
     stated : keys that the user gave. `text.encoding` and `text.delimiter` are taken; `text.header`
     only says that a doubt about the header is no error.
