@@ -61,9 +61,10 @@ def propose_clock(p: Proposal) -> None:
     one may and others a part of it, like a date or whole seconds that are the same in all rows of a
     recording; these are not looked for beside a clock whose cells tell the day. It is `?`, too, if
     no column may, but the columns have no names, or one is named `s`, which may be seconds or the
-    tool's position, or one may count the samples (`is_counter`). Otherwise, if no column may, it
-    stays empty. Stated columns are kept; only their forms are found. Of a column that is set
-    `time.format` may be `?` (`form_of`). Raises SettingError for a malformed `windows.trigger`.
+    tool's position, one may count the samples (`is_counter`), or one is named like a clock and has
+    numbers that change. Otherwise, if no column may, it stays empty. Stated columns are kept; only
+    their forms are found. Of a column that is set `time.format` may be `?` (`form_of`). Raises
+    SettingError for a malformed `windows.trigger`.
     """
     clocks = [*filter(is_clock, p.unused)]
     if is_stated := "time.column" in p.stated:
@@ -73,12 +74,18 @@ def propose_clock(p: Proposal) -> None:
     names = [c.name for c in p.unused if c in clocks or (c in coarse and not has_days)]
     if not clocks:
         has_no_names = "c0" in p.description.text.names or "s" in p.columns  # may be the stroke
-        names = [*p.columns] if has_no_names else [c.name for c in p.unused if is_counter(c)]
+        names = [
+            c.name for c in p.unused if is_counter(c) or (NAME.search(c.name) and c.usual_step)
+        ]
+        names = [*p.columns] if has_no_names else names
     if clocks and (is_stated or len(names) == 1):
         p.put("time.column", [column.name for column in clocks])
         p.put("time.format", [form_of(column, p) for column in clocks])
     elif names:
-        text = f"of {listed(names)}: one, several that are added (a date, a time, ms), or []: none"
+        text = (
+            f"of {listed(names)}: one, several that are added (a date, a time, ms), or []: none; "
+            "with time.sort=true if the rows of a part are not in the order of time"
+        )
         p.put("time.column", UNKNOWN, text)
 
 
@@ -113,7 +120,7 @@ def is_counter(column: Column) -> bool:
     usual = float(np.median(steps)) if len(steps) else 0.0
     is_even = bool((np.abs(steps - usual) <= EVEN * abs(usual)).all())
     if COUNTER_NAME.fullmatch(column.name):
-        return not is_even
+        return usual < 0 or not is_even
     is_channel = quantity_of(column.unit) or any(name.search(column.name) for name in FORCES[:2])
     return is_even and usual not in (0, 1) and not is_channel and ANY not in column.name
 

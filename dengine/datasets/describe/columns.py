@@ -24,11 +24,16 @@ from ..units import bare, unit_in
 
 DAY = "%Y-%m-%d"
 DAYS = ("%d.%m.%Y", "%Y/%m/%d", "%m/%d/%Y", "%d/%m/%Y", "%d.%m.%y", "%d-%b-%y", "%d-%b-%Y")
-TIMES = ("%H:%M:%S.%f", "%H:%M:%S", "%H:%M:%S:%f", "%I:%M:%S.%f %p", "%I:%M:%S %p")
+TIMES = (
+    *("%H:%M:%S.%f", "%H:%M:%S", "%H:%M:%S:%f", "%H:%M"),
+    *("%I:%M:%S.%f %p", "%I:%M:%S %p"),
+)
 MOMENTS = (f"{day} {time}" for day in DAYS for time in TIMES)
 ZONED = ("%Y-%m-%d %H:%M:%S.%f UTC", "%Y-%m-%d %H:%M:%S.%f")
 FORMS = (DAY, ISO, *DAYS, *TIMES, "%M:%S.%f", *ZONED, *MOMENTS)
-LIKE_A_TIME = re.compile(r"\d+[:\-./T](\d+|[A-Za-z]{3})[:\-./T]\d|\d+:\d+\.\d|\d{8}T\d{6}")
+LIKE_A_TIME = re.compile(
+    r"\d+[:\-./T](\d+|[A-Za-z]{3})[:\-./T]\d|\d+:\d+\.\d|\d{8}T\d{6}|\d+:\d\d$"
+)
 LEAST_RUN = 8  # rows of a part
 MOST_WORDS = 12  # that are told apart, as labels
 LOST = ("nan", "null", "none", "n/a", "na", "-", "--", "---", "#n/a", "")

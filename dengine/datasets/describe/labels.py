@@ -25,7 +25,7 @@ GOOD = (
 )
 BAD = (
     *("nok", "not ok", "not_ok", "not-ok", "fail", "failed", "bad", "failure", "schlecht", "false"),
-    *("n.i.o.", "n.i.o", "n_i_o", "nio", "ng", "reject", "rejected", "不合格"),
+    *("n.i.o.", "n.i.o", "n_i_o", "n-io", "n_io", "nio", "ng", "reject", "rejected", "不合格"),
 )
 UNCHECKED = ("", "-", "--", "pending", "open", "offen", "unchecked", "not checked", "n/a")
 YES = ("1", "true", "yes", "ja")
@@ -46,7 +46,7 @@ NEGATED = re.compile(  # or of a name that may be bad, as in `leak=False`
 )
 PATHS = (  # of verdicts in folders, and at the end or beginning of names
     rf"(?:^|/)({WORD})/",
-    rf"[-_ ]({WORD})/",
+    rf"[-_ =]({WORD})/",
     rf"(?:^|[-_ ./(=+\[])({WORD})[-_ \d()\]]*$",
     rf"(?:^|/)({WORD})(?=[-_ ][^/]*$)",
 )
@@ -188,8 +188,7 @@ def sources_of(p: Proposal, paths: Names) -> Iterator[LabelSource]:
                     source = replace(label, listing=name, key=key, column=column)
                     if may_be_labels(source, table.words(column)):
                         yield source
-    if p.description.layout in ("files", "columns"):
-        yield from (replace(label, path=path) for path in (*in_paths(paths), *PLACES))
+    yield from (replace(label, path=path) for path in (*in_paths(paths), *PLACES))
     yield from (replace(label, column=column.name) for column in p.unused if column.fixed)
     yield from (replace(label, line=line) for line in lines_of(p))
 

@@ -4,9 +4,9 @@ import re
 from collections import Counter
 from dataclasses import replace
 
-from ...errors import listed
+from ...errors import DataError, listed
 from ..description import ANY, UNKNOWN, Channel, TextForm
-from ..read.split import OBJECTS, has_lists, split
+from ..read.split import LISTS, OBJECTS, split
 from ..table import Table
 from .clock import NAME as CLOCK_NAME
 from .columns import LEAST_RUN, Column, Proposal, Tables, columns_of
@@ -14,7 +14,7 @@ from .columns import LEAST_RUN, Column, Proposal, Tables, columns_of
 PART_NAME = re.compile(
     r"(?i)part|serial|episode|teil(?!schritt)|werkst(?!.*tr(ä|ae?)ger)|barcode|dmc|trial|piece"
     r"|sample_?id"
-    r"|^(id|run|sn|cycle|shot|nr|no)$|(?<!order)(?<!batch)(?<!shift)(?<!lot)_(id|run|cycle|sn|nr)$"
+    r"|^(id|run|sn|cycle|shot|nr|no)$|cycle.?(no|nr|id)$|(?<!order)(?<!batch)(?<!shift)(?<!lot)_(id|run|cycle|sn|nr)$"
 )
 NUMBER = re.compile(r"\d+(\.\d+)?(e-?\d+)?(?=[\])]?( ?[\[(][^\d\[(]+[\])])?$)")  # as in `F_0.5 [N]`
 LEAST_NUMBERED = 20  # columns with numbers behind one name that are the samples of a part
@@ -25,21 +25,28 @@ def layout_of(p: Proposal, files: Tables) -> str:
     """Return how the files hold parts, as `Description.layout` names it; `?` if it is not certain.
 
     `files` has the table of each file that is looked at. These rules come one after another.
-    Several JSON or .ts files, of which the first has one row, are `files`. Lists of two items or
-    more in the first row of the first table, or 20 or more columns like `x0`, `x1`, make it `wide`,
-    or `npz` for an .npz file. It is `long` if a column of the first table may tell the parts apart
-    (`may_tell_parts`), or if a file has several words of a stated `part.column`; unless it is
-    stated, `part.column` is then set in `p` to the only such column with a name like that of a
-    part's number and no word in two files, or to `?` with a note; this clears `part.path` and
-    `part.line`, also stated ones. Several files, of which `p.names` may have more than were looked
-    at, are `files`. A single one gives `?`, with a note on what to state. Raises UnreadableError if
-    cells of columns that are looked at are lists.
+    Several JSON or .ts files, of which the first has one row, are `files`, unless this row has 20
+    or more columns like `x0`, `x1`. Such columns, or lists of two items or more in the first row of
+    the first table, make it `wide`, or `npz` for an .npz file. It is `long` if a column of the
+    first table may tell the parts apart (`may_tell_parts`), or if a file has several words of a
+    stated `part.column`; unless it is stated, `part.column` is then set in `p` to the only such
+    column with a name like that of a part's number and no word in two files, or to `?` with a note;
+    this clears `part.path` and `part.line`, also stated ones. Several files, of which `p.names` may
+    have more than were looked at, are `files`. A single one gives `?`, with a note on what to
+    state. Raises DataError if the lists in 8 rows or more have fewer than 8 items, like the vectors
+    of a force and a torque, and UnreadableError if cells of columns that are looked at are lists.
     """
     kind = p.description.format
     first = files[0]
-    if kind in OBJECTS and len(p.names) > 1 and len(first.lines) == 1:
+    is_wide = bool(numbered_columns(first))
+    if kind in OBJECTS and len(p.names) > 1 and len(first.lines) == 1 and not is_wide:
         return "files"
-    if has_lists(first) or numbered_columns(first):
+    cells = [column[0] for column in first.columns.values() if len(column)]
+    longest = max((len(cell) for cell in cells if isinstance(cell, LISTS)), default=0)
+    if not is_wide and 1 < longest < LEAST_RUN <= len(first.lines):
+        text = f"lists of {longest}: make a column of each item"
+        raise DataError(f"Expected numbers or curves in the cells of {first.source}, got {text}.")
+    if is_wide or longest > 1:
         return "npz" if kind == "npz" else "wide"
     columns = columns_of(files, TextForm())
     runs = [column for column in columns.values() if may_tell_parts(column)]

@@ -19,14 +19,15 @@ from ..units import quantity_of
 from .clock import COUNTER_NAME, is_clock, propose_clock, propose_rate
 from .clock import NAME as CLOCK_NAME
 from .columns import FORCES, LOST, MOST_WORDS, Column, Proposal, columns_of, counts_of
-from .labels import NAME, has_meaning, lines_of, part_words, propose_label
+from .labels import NAME, WORD, has_meaning, lines_of, part_words, propose_label
 from .layout import PART_NAME
 
 SPARSE = 0.1
 STRANGE = 0.01
 MOST_STEP = 1.5  # from one number of a column like `x0`, `x1` to the next, in usual steps
 PART_LINE = re.compile(
-    r"(?i)serial|(?<!fixture )barcode|dmc|part ?(no|num|id)|teilenummer|werkst.ck(?!tr)|serien"
+    r"(?i)^sn$|specimen|serial|(?<!fixture )barcode|dmc|part ?(no|num|id)|teilenummer|serien"
+    r"|werkst.ck(?!tr)"
 )
 QUALIFIER_NAME = re.compile(
     r"(?i)status|valid|g(ü|ue)ltig|qualit|flag|error|fehler|(?<!de)fault(?!.?time)|d[ée]faut|satur(?!d)"
@@ -35,19 +36,29 @@ QUALIFIER_NAME = re.compile(
 )
 SIGNAL = re.compile(r"(?i)(force|kraft|torque|drehmoment|load|last)([_ ]?[xyz])?")
 LOADS = ("force", "torque")
-SENTINEL = re.compile(r"(?i)-?9{4,}([.,]0+)?|-999[.,]25|-?1([.,]0+)?e\+?3\d|3[.,]4028\d*e\+?38")
-SCALE_NAME = re.compile(
-    r"(?i)(^|[^a-z])(unit(?!.*(serial|id|no|nr|under))|einheit|scale|factor|faktor"
-    r"|(sampl\w*|abtast|scan|data)[ _]?rate)s?($|[^a-z])"
+SENTINEL = re.compile(
+    r"(?i)[-+]?(9{4,}([.,](0+|9+))?|1([.,]0+)?e\+?3\d|9[.,]9\d*e\+?37|3[.,]40\d*e\+?38)"
+    r"|-999[.,](25|0+)"
 )
-SET_VALUE = re.compile(r"(?i)(^|[^a-z])(set|soll|vorgabe|nominal|target|consigne|max|min|limit)")
+VERDICT_FOLDER = re.compile(rf"(?i)(?<![^/])({WORD})/")
+STAMP_NAME = re.compile(r"(?i)stamp|stempel|created|date|datum|epoch")
+SCALE_NAME = re.compile(
+    r"(?i)(^|[^a-z]|(?-i:(?<=[a-z])(?=[A-Z])))(unit(?!.*(serial|id|no|nr|under))|uom|einheit|scale"
+    r"|scaling|factor|faktor|gain|sensitivity|fs|dt|frequency|interval"
+    r"|(sampl\w*|abtast|scan|data)[ _]?(rate|freq\w*))s?($|[^a-z])"
+)
+SET_VALUE = re.compile(
+    r"(?i)(^|[^a-z]|(?-i:(?<=[a-z])(?=[A-Z])))"
+    r"(set|soll|vorgabe|nominal|target|consigne|max|min|limit)"
+)
 
 # Dates in names. Those in the group `odd` are not sorted by name: they have the day or the month
 # first, the month as a word, or AM and PM.
 DATE = re.compile(
     r"(?i)(?P<odd>(?<![a-z])(jan|feb|m[aä]r|apr|ma[iy]|jun|jul|aug|sep|o[ck]t|nov|de[cz])(?![a-z])"
     r"|\d ?[ap]m(?![a-z])|(?<!\d)\d\d?([-_])\d\d?\3(19|20)\d\d(?!\d)"
-    r"|(?<!\d)[0-3]\d[01]\d20[0-3]\d(?!\d))|(?<!\d)(19|20)\d\d([-_.]?)[01]\d\6[0-3]\d"
+    r"|(?<!\d)[0-3]\d[01]\d20[0-3]\d(?!\d)|(?<!\d)[0-3]\d([-_.])[01]\d\5\d\d(?!\d))"
+    r"|(?<!\d)(19|20)\d\d([-_.]?)[01]\d\7[0-3]\d"
 )
 ODD = (
     "name, if that is the order; the names have dates that are sorted otherwise: rename the files, "
@@ -329,8 +340,8 @@ def propose_lengths(p: Proposal) -> None:
     Recordings without rows are ignored; if all are, the length is 0. If some have another length,
     and `traces.lengths` is not stated, a note counts them, and `traces.lengths` becomes `pad` if
     they are more than 10 % of the recordings, else `strict`. A stated `traces.samples` stays.
-    Unless it is stated, another note counts the recordings that end with two zeros or more, if they
-    are more than 10 %: the zeros may fill up shorter recordings.
+    Unless it is stated, another note counts the recordings that end with two zeros or NaN or more,
+    if they are more than 10 %: these may fill up shorter recordings.
     """
     if p.description.channels:
         column = p.columns[next(iter(p.description.channels))]
@@ -344,8 +355,8 @@ def propose_lengths(p: Proposal) -> None:
             )
             is_few = len(others) <= SPARSE * len(lengths)
             p.put("traces.lengths", "strict" if is_few else "pad", text)
-        n_filled = sum(np.array_equal(x[-2:], [0, 0]) for x in column.numbers)
-        note = f"{n_filled} recordings end with several zeros: are these samples?"
+        n_filled = sum(np.array_equal(np.nan_to_num(x[-2:]), [0, 0]) for x in column.numbers)
+        note = f"{n_filled} recordings end with several zeros or NaN: are these samples?"
         usual = p.description.traces.samples or usual
         p.put("traces.samples", usual, note if n_filled > SPARSE * len(lengths) else "")
 
@@ -353,22 +364,28 @@ def propose_lengths(p: Proposal) -> None:
 def propose_order(p: Proposal) -> None:
     """Set `order` in `p` to `?`, with a note, if the file names, sorted, need not be the order.
 
-    That is so if a file name stands in several folders, once the text of `label.path` is left out;
-    if a file name has a date with the day or the month first, the month as a word, or AM or PM, by
-    which names do not sort; if the names are not in the order of their dates; or if a column of
-    `p.unused` has one date or time per recording, and these, as `natural_key` sorts texts, are in
+    That is so if the files of the folders, one folder after the other, have another order, with the
+    text of `label.path` left out; if a file name has a date with the day or the month first, the
+    month as a word, or AM or PM, by which names do not sort; if the names are not in the order of
+    their dates; or if a column of `p.unused` has one word per recording, which is a date or time or
+    whose name says so (`timestamp`, `created`), and these, as `natural_key` sorts texts, are in
     another order. If several of these hold, the note is on the last. An `order` that the user
     stated stays. Raises SettingError for a malformed `windows.trigger`.
     """
     paths = [without_label(p.description.label, without_suffix(name)) for name in p.names]
+    # A folder of a verdict is no step of the production, even if the label stands elsewhere.
+    paths = sorted((VERDICT_FOLDER.sub("", path) for path in paths), key=natural_key)
     names = [path.rpartition("/")[2] for path in paths]
-    if len({*paths}) > len({*names}):
+    label_is_open = p.description.label.column == UNKNOWN  # and may be a folder
+    if not label_is_open and names != sorted(names, key=natural_key):
         p.put("order", UNKNOWN, "name: by file name, or path: folder by folder")
+    names.sort(key=natural_key)
     matches = [*filter(None, map(DATE.search, names))]
     dates = [match.string[match.start() :] for match in matches]
     if any(match["odd"] for match in matches) or dates != sorted(dates, key=natural_key):
         p.put("order", UNKNOWN, ODD)
     for column in p.unused:
-        ranks = [*map(natural_key, column.fixed)] if column.forms else []
+        is_stamp = column.forms or STAMP_NAME.search(column.name)
+        ranks = [*map(natural_key, column.fixed)] if is_stamp else []
         if ranks != sorted(ranks):
             p.put("order", UNKNOWN, f"name, or {column.name}, whose dates have another order")

@@ -131,12 +131,14 @@ def as_cells(values: Any) -> Cells:
 
 
 def read_frame(frame: Any, source: str) -> Table:
-    """Return the table of a DataFrame, whose index is a column if it has a name.
+    """Return the table of a DataFrame, whose index is a column, or several.
 
-    `source` is the table's name in errors. Names of columns become texts; rows are numbered from 1.
-    Raises ValueError if the index is named like a column.
+    An index without a name, of one level and not of times, is left out. `source` is the table's
+    name in errors. Names of columns become texts; rows are numbered from 1. Raises ValueError if
+    the index is named like a column.
     """
-    frame = frame.reset_index(drop=frame.index.name is None)
+    is_plain = frame.index.names == [None] and frame.index.dtype.kind not in "mM"
+    frame = frame.reset_index(drop=is_plain)
     columns = {str(name): frame[name].to_numpy() for name in frame.columns}
     return Table(source, columns, np.arange(1, len(frame) + 1))
 
@@ -145,7 +147,7 @@ def read_parquet(content: bytes, source: str) -> Table:
     """Return the table of a Parquet file.
 
     `content` has its bytes, and `source` is its name in errors. An index that pandas stored in it
-    is a column if it has a name, and is left out otherwise. Raises DataError if it is no Parquet
+    is read as `read_frame` does. Raises DataError if it is no Parquet
     file or is damaged, or if pyarrow is not installed.
     """
     with read_errors(source, "a Parquet file", "pyarrow", "files"):

@@ -24,7 +24,7 @@ from .bags import read_bag
 from .clock import check_steps, times_of
 from .files import caught, find_files, natural_key, read_file
 from .frames import read_frame
-from .places import LabelReader, part_of, read_labels, without_label
+from .places import LabelReader, part_of, read_labels, without_label, without_suffix
 from .split import split, table_of
 from .windows import cut
 
@@ -90,7 +90,7 @@ def recording_of(
     if label is None:
         return None
     if order == "path":
-        rank = natural_key(without_label(description.label, table.path))
+        rank = natural_key(without_label(description.label, without_suffix(table.path)))
     elif order not in ORDERS:
         rank = natural_key(table.one_word(order, "first"))
     trace = fitted(np.stack(samples), seconds, description)

@@ -17,6 +17,7 @@ from .text import read_text
 
 NUMBERED = r"(\d+(?:\.\d+)?(?:e-?\d+)?)"  # for which `*` stands in a wide table: `F*` is not `Fmax`
 OBJECTS = ("json", "jsonl", "ts")
+LISTS = (list, np.ndarray)
 
 
 def table_of(content: bytes, name: str, description: Description) -> Table:
@@ -112,7 +113,7 @@ def split(table: Table, description: Description) -> Iterator[Table]:
 def has_lists(table: Table) -> bool:
     """Return whether the first cell of any column is a list or array of two items or more."""
     cells = [column[0] for column in table.columns.values() if len(column)]
-    return any(isinstance(cell, list | np.ndarray) and len(cell) > 1 for cell in cells)
+    return any(isinstance(cell, LISTS) and len(cell) > 1 for cell in cells)
 
 
 def _split_rows(table: Table, description: Description) -> Iterator[Table]:
