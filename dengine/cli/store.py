@@ -133,8 +133,7 @@ def report(part: str, label: str, **changing: Any) -> None:
                 engine.version,
             )
         engine.report(id_, LABELS[label])
-        text = f"decision {id_} was {label}"
-        event = engine.store.events.put("report", text, author=author)
+        event = engine.store.events.put("report", f"decision {id_} was {label}", author=author)
         return Changed("report", f"Decision {id_} was {label}.", event, engine.version)
 
     _change_and_print(change, **changing)
@@ -345,10 +344,9 @@ def _verification_lines(report: HistoryReport) -> list[str]:
     """
     lines = []
     for cell in report.cells:
-        digest = cell.digest or "none"
         lines.append(
             f"Cell {cell.cell_id}: {cell.entries:,} entries over {cell.rows:,} rows, newest digest "
-            f"{digest}"
+            f"{cell.digest or 'none'}"
         )
         if cell.waiting is None:
             lines.append(

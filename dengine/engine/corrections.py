@@ -287,8 +287,12 @@ class Corrections:
             What a model raises that must be fitted again; for the state of another reducer in rare
             cases KeyError, ValueError or NotImplementedError.
         """
-        do = "`store.versions.retrains()` lists them"
-        expect(is_whole(version, -(2**63), 2**63 - 1), "the number of a version", version, do)
+        expect(
+            is_whole(version, -(2**63), 2**63 - 1),
+            "the number of a version",
+            version,
+            "`store.versions.retrains()` lists them",
+        )
         self._bring_up_to_date()
         before = self._live.version
         pinned = self._live.pinned

@@ -419,8 +419,7 @@ class Retrainer:
         failure = f"{type(error).__name__}: {error}"
         if not is_broken:
             self.discard()
-            seconds = time.monotonic() - self._began
-            failure = f"not done after {seconds:.0f} s in the executor."
+            failure = f"not done after {time.monotonic() - self._began:.0f} s in the executor."
         if is_broken or self._count_seconds_left() <= 0.0:
             self._replace_executor()
         return f"dropped: RuntimeError: {failure}"

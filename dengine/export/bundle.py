@@ -71,9 +71,13 @@ def make_key(path: FilePath) -> Path:
         file that was begun then stays.
     """
     target = Path(path)
-    do = "name a new file in a folder that is writable; files may be signed with an old key"
     with (
-        instead(ExportError, f"Cannot write {target}", OSError, do=do),
+        instead(
+            ExportError,
+            f"Cannot write {target}",
+            OSError,
+            do="name a new file in a folder that is writable; files may be signed with an old key",
+        ),
         open(target, "x", encoding="ascii", opener=partial(os.open, mode=0o600)) as file,
     ):
         file.write(secrets.token_hex(32) + "\n")
@@ -155,8 +159,9 @@ def prepare_export(
             f"compile to TorchScript; use {' or '.join(SCALAR_BOUNDS)}, and a rule that does."
         )
     if model.rule_is_stale:
-        problem = "The rule has missed what became of a part"
-        raise ExportError(f"{problem}; open the engine's store again, then export.")
+        raise ExportError(
+            "The rule has missed what became of a part; open the engine's store again, then export."
+        )
     if encoder is None:
         raise ExportError(f"{model.name} cannot be exported, for {model.spaces.why_no_module_}.")
     conditions = DecisionConditions(
@@ -343,8 +348,10 @@ def read_checked(path: Path, key: FilePath | None = None) -> bytes:
     content = _read(path)
     expected = _first_word(_read(sibling_path(path, "sha256"), SUM_BYTES))
     if not SHA256.fullmatch(expected):
-        problem = f"{path}.sha256 holds no SHA-256 sum of {path.name}"
-        raise ExportError(f"{problem}; copy it again together with {path.name}.")
+        raise ExportError(
+            f"{path}.sha256 holds no SHA-256 sum of {path.name}; copy it again together with "
+            f"{path.name}."
+        )
     digest = hashlib.sha256(content).hexdigest()
     if digest != expected:
         raise ExportError(
@@ -355,11 +362,15 @@ def read_checked(path: Path, key: FilePath | None = None) -> bytes:
         signed = signature(content, key)
         file = sibling_path(path, "sig")
         if not file.exists():
-            problem = f"A key was given, and {path} is not signed: {file} is missing"
-            raise ExportError(f"{problem}; export it anew with it.")
+            raise ExportError(
+                f"A key was given, and {path} is not signed: {file} is missing; export it anew "
+                "with it."
+            )
         if not hmac.compare_digest(_first_word(_read(file, SUM_BYTES)).encode(), signed.encode()):
-            problem = f"{path} has no signature by the key in {key}"
-            raise ExportError(f"{problem}: it was changed, or signed with another one.")
+            raise ExportError(
+                f"{path} has no signature by the key in {key}: it was changed, or signed with "
+                "another one."
+            )
     return content
 
 
@@ -375,9 +386,16 @@ def _read(path: Path, most: int = -1) -> bytes:
 
     Raises ExportError if it is missing or cannot be read.
     """
-    do = "an export is a file and its .sha256, copied together"
-    problem = f"{path} cannot be read"
-    with instead(ExportError, problem, OSError, ValueError, do=do), path.open("rb") as file:
+    with (
+        instead(
+            ExportError,
+            f"{path} cannot be read",
+            OSError,
+            ValueError,
+            do="an export is a file and its .sha256, copied together",
+        ),
+        path.open("rb") as file,
+    ):
         return file.read(most)
 
 

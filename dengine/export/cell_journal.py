@@ -124,9 +124,9 @@ def read_journal(path: FilePath, spec: TraceSpec) -> CellJournal:
     *rows, tail = Path(path).read_bytes().split(b"\n")
     head = rows[0].decode("utf-8", errors="replace").split() if rows else []
     if len(head) != 4 or head[:3] != ["#", "dengine", str(FORM)]:
-        wanted = f"Expected a journal that begins with '# dengine {FORM} SUM'"
         raise DataError(
-            f"{wanted}, {path} does not; import it with the dengine whose program wrote it."
+            f"Expected a journal that begins with '# dengine {FORM} SUM', {path} does not; import "
+            "it with the dengine whose program wrote it."
         )
     lines: list[JournalLine] = []
     parts: dict[str, JournalLine] = {}  # by id, with the label so far
@@ -146,9 +146,14 @@ def read_journal(path: FilePath, spec: TraceSpec) -> CellJournal:
             )
             break
         crcs.append(crc)
-        problem = f"{where} is no line of this store's cell"
         with (
-            instead(DataError, problem, ValueError, LookupError, TraceError),
+            instead(
+                DataError,
+                f"{where} is no line of this store's cell",
+                ValueError,
+                LookupError,
+                TraceError,
+            ),
             np.errstate(over="ignore"),  # a sample beyond float32 is infinite
         ):
             kind, *words = content.decode().split(",")
@@ -278,17 +283,19 @@ def import_journal(store: "StoreLike", path: FilePath, any_model: bool = False) 
         settings = opened.settings.read()
         spec = stored_trace_spec(settings)
         if spec is None or "recipe" not in settings:
-            wanted = "Expected the store that the model was exported from"
-            raise StoreError(f"{wanted}, {store} has no TraceSpec or no recipe.")
+            raise StoreError(
+                f"Expected the store that the model was exported from, {store} has no TraceSpec or "
+                "no recipe."
+            )
         policy = Recipe.from_toml(settings["recipe"]).policy
         journal = read_journal(path, spec)
         exports = {
             event.text.split()[0] for event in opened.events.newest() if event.kind == EXPORTED
         }
         if exports and journal.sum not in exports and not any_model:
-            wanted = "Expected a journal of a model that was exported from this store"
             raise DataError(
-                f"{wanted}, {path} belongs to {journal.sum[:12]}…, which is none of its exports; "
+                "Expected a journal of a model that was exported from this store, "
+                f"{path} belongs to {journal.sum[:12]}…, which is none of its exports; "
                 "name the store that it came from, or say --any-model if it is right."
             )
         lines = _with_known_outcomes(journal, policy.stops)

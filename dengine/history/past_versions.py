@@ -306,5 +306,7 @@ class Novelty:
     gaps: float
 
     def __str__(self) -> str:
-        rest = f"texture {self.texture:.2f}, distortion {self.distortion:.2f}, gaps {self.gaps:.2f}"
-        return f"in level {self.level:.2f} times the limit, {rest}"
+        return (
+            f"in level {self.level:.2f} times the limit, texture {self.texture:.2f}, distortion "
+            f"{self.distortion:.2f}, gaps {self.gaps:.2f}"
+        )

@@ -509,8 +509,9 @@ def _os_errors(path: Path, owning: bool = True) -> AbstractContextManager[None]:
 
     The advice is about writing the journal, or if `owning` is False about reading it.
     """
-    do = "free some space there, or make its folder writable"
-    do = do if owning else "read it as the user that its cell runs as"
+    do = "read it as the user that its cell runs as"
+    if owning:
+        do = "free some space there, or make its folder writable"
     return instead(StoreError, f"Could not use the journal {path}", OSError, do=do)
 
 

@@ -108,10 +108,9 @@ def check_cell_exists(url: str, cell_id: str) -> None:
     with reading(url) as connection:
         names = sorted(connection.execute(sa.select(SETTING.c.cell_id).distinct()).scalars())
     if cell_id not in names:
-        cells = ", ".join(names)
         raise StoreError(
-            f"Expected a cell of this store, got {cell_id!r}; it holds {cells}. Name one of "
-            "them: --cell NAME."
+            f"Expected a cell of this store, got {cell_id!r}; it holds {', '.join(names)}. Name "
+            "one of them: --cell NAME."
         )
 
 

@@ -204,8 +204,14 @@ def verify_history(
     if expected and not any(
         digest.startswith(expected) for check in checks for digest in check.digests
     ):
-        problem = "is in no entry: the history was cut off before it, or made anew"
-        faults.append(HistoryFault(cell_id or "", LEDGER.name, f"digest {expected}", problem))
+        faults.append(
+            HistoryFault(
+                cell_id or "",
+                LEDGER.name,
+                f"digest {expected}",
+                "is in no entry: the history was cut off before it, or made anew",
+            )
+        )
     cells = [
         CellHistory(
             cell_id=check.cell_id,

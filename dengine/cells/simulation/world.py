@@ -228,10 +228,9 @@ def _fixture_xml(c: Conditions) -> str:
     parts.append(f'<geom type="box" size="0.03 0.03 0.005" pos="0 0 {-depth - 0.005}"/>')
     if c.debris_mm > 0:
         position = f"{c.debris_x_mm / 1000} {c.debris_y_mm / 1000} {-depth + chip}"
-        soft = f"{c.debris_softness_s} 1"
         parts.append(
-            f'<geom type="box" size="0.003 0.003 {chip}" pos="{position}" solref="{soft}" '
-            'priority="1"/>'
+            f'<geom type="box" size="0.003 0.003 {chip}" pos="{position}" '
+            f'solref="{c.debris_softness_s} 1" priority="1"/>'
         )
     return "\n".join(parts)
 

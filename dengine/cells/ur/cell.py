@@ -264,8 +264,10 @@ class UrCell(AbstractContextManager["UrCell"]):
             failure = "its program has stopped; start it and"
         else:
             return None
-        order = f"order {self._number} ({verb.name.lower()})"
-        raise CellError(f"Expected the robot to carry out {order}, {failure} begin again.")
+        raise CellError(
+            f"Expected the robot to carry out order {self._number} ({verb.name.lower()}), "
+            f"{failure} begin again."
+        )
 
     def _wait_until_ready(self) -> int:
         """Wait until the robot's program runs and has answered its last order; return the number of
