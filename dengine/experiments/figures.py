@@ -218,14 +218,13 @@ def _draw_neighbourhood(figure: Figure, centre: Floats, radius: float, is_strip:
     """
     from matplotlib.patches import Circle
 
-    style: Style = {"edgecolor": BLACK, "linewidth": 1.4}
     x, y = centre
     for axes in figure.axes:
         if is_strip:
             for end in (x - radius, x + radius):
                 axes.axvline(end, color=BLACK, linewidth=1.4)
         else:
-            axes.add_patch(Circle((x, y), radius, fill=False, **style))
+            axes.add_patch(Circle((x, y), radius, fill=False, edgecolor=BLACK, linewidth=1.4))
         label = f"newest part; its neighbourhood ends at the black line, radius {radius:g}"
         (mark,) = axes.plot(x, y, "+", color=BLACK, markersize=9, label=label)
     figure.legend(handles=[mark], loc="outside lower center", frameon=False, fontsize=SMALL)
@@ -323,8 +322,14 @@ def curves(by_recipe: Mapping[str, Sequence[Replay]], title: str = "") -> Figure
     for colour, (name, replays) in zip(cycle(colours), by_recipe.items(), strict=False):
         shares = window_curves(replays, window, FEWEST)
         x = shares.index + 1  # cycles are counted from 1
-        low = shares["certain_low"]
-        certain.fill_between(x, low, shares["certain_high"], color=colour, alpha=0.15, linewidth=0)
+        certain.fill_between(
+            x,
+            shares["certain_low"],
+            shares["certain_high"],
+            color=colour,
+            alpha=0.15,
+            linewidth=0,
+        )
         certain.plot(x, shares["certain"], color=colour)
         precision.plot(x, shares["precision"], color=colour)
         wrong = []
@@ -393,20 +398,33 @@ def cost_picture(curve: CostCurve, unit: str = "s") -> Figure:
     left, right = figure.subplots(1, 2, sharey=True, width_ratios=(3, 1))
     end = 1.3 * max(costs.check, *(row.cost for row in rows))
     left.axvline(costs.check, label="check everything", **LIMIT)
-    style: Style = {"color": BLUE, "capsize": 3, "fmt": "o"}
     for y, row in enumerate(rows):
         is_last = y < n_last
         errors = [[row.cost - max(row.lower, 0.0)], [min(row.upper, end) - row.cost]]
-        label = labels.get(y, "_")
-        fill = BLUE if is_last else "none"
-        left.errorbar(row.cost, y, xerr=errors, label=label, markerfacecolor=fill, **style)
+        left.errorbar(
+            row.cost,
+            y,
+            xerr=errors,
+            label=labels.get(y, "_"),
+            color=BLUE,
+            markerfacecolor=BLUE if is_last else "none",
+            capsize=3,
+            fmt="o",
+        )
         if row.upper > end:
             left.text(end, y, f"to {amount(row.upper)} \u2192", ha="right", va="bottom", size=SMALL)
         right.barh(y, 100 * (row.accepted + row.rejected), color=BLUE, fill=is_last)
     if curve.policy is not None:
-        ring: Style = {"facecolors": "none", "edgecolors": BLACK, "linewidths": 1.6, "zorder": 5}
-        where = curve.rows.index(curve.marked)
-        left.scatter(curve.marked.cost, where, s=200, label=f"choice: {curve.verdict}", **ring)
+        left.scatter(
+            curve.marked.cost,
+            curve.rows.index(curve.marked),
+            s=200,
+            label=f"choice: {curve.verdict}",
+            facecolors="none",
+            edgecolors=BLACK,
+            linewidths=1.6,
+            zorder=5,
+        )
     left.set_yticks(range(len(rows)), [policy_name(row.policy) for row in rows])
     left.invert_yaxis()
     finish(left, 4, xlim=(0.0, end), xlabel=f"cost a part [{unit}]")
@@ -470,10 +488,17 @@ def explained_picture(explanation: Explanation) -> Figure:
         _draw_neighbours(axes, x, explanation, channel)
         axes.plot(x, trace[channel], color=BLACK, linewidth=1.6, label="this trace")
         if is_outside[channel].any():
-            height = axes.get_xaxis_transform()
-            where = is_outside[channel]
-            shade: Style = {"color": ORANGE, "alpha": 0.3, "label": "outside the band"}
-            axes.fill_between(x, 0.0, 1.0, where=where, transform=height, zorder=0, **shade)
+            axes.fill_between(
+                x,
+                0.0,
+                1.0,
+                where=is_outside[channel],
+                transform=axes.get_xaxis_transform(),
+                zorder=0,
+                color=ORANGE,
+                alpha=0.3,
+                label="outside the band",
+            )
         finish(axes, legend=0 if i else 3, ylabel=labels[channel])
     panels[-1].set(xlabel=x_label)
     return figure
@@ -491,11 +516,10 @@ def _draw_neighbours(axes: Axes, x: Floats, explanation: Explanation, channel: i
             for neighbour in explanation.neighbours
             if neighbour.trace is not None and neighbour.success is success
         ]
-        style: Style = {"color": colour, "linewidth": 0.7, "alpha": 0.55}
         for i, trace in enumerate(traces):
             # matplotlib leaves labels that begin with _ out of the legend.
             label = "_" if i else f"neighbours that were {name} ({len(traces)})"
-            axes.plot(x, trace, line, label=label, **style)
+            axes.plot(x, trace, line, label=label, color=colour, linewidth=0.7, alpha=0.55)
 
 
 def _draw_band(
@@ -554,8 +578,12 @@ def _draw_drift(figure: Any, data: Dataset, finite: NDArray[np.bool_], label: st
     top, bottom = figure.subplots(2, 1, sharex=True)
     window = max(1, len(y) // 10)
     x = np.arange(1, len(y) + 1)
-    share = 100 * pd.Series(y).rolling(window).mean()
-    top.plot(x, share, color=VERIFIED, label=f"good, of the last {window}")
+    top.plot(
+        x,
+        100 * pd.Series(y).rolling(window).mean(),
+        color=VERIFIED,
+        label=f"good, of the last {window}",
+    )
     top.axhline(100 * y.mean(), label="good, of all", **LIMIT)
     finish(top, ylim=(0, 104), ylabel="share [%]")
     for success, name, colour, _, _ in LABEL_STYLES:
