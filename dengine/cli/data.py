@@ -174,7 +174,7 @@ def _save(
     has. Raises OutputError for another file without `--force`, and if the file cannot be written.
     Without `--save` nothing is written.
     """
-    return description.save(source.path, bool(context.params.get("force"))) if save else None
+    return description.save(source.path, context.params["force"]) if save else None
 
 
 def _trace_line(dataset: "Dataset", i: int) -> str:

@@ -152,7 +152,7 @@ class CommaList(click.ParamType[Any]):
         """
         if isinstance(value, tuple):
             return value
-        items = [item.strip() for item in str(value).split(",") if item.strip()]
+        items = [item.strip() for item in value.split(",") if item.strip()]
         if not items:
             self.fail("expected at least one value, with commas between.", param, ctx)
         return tuple(self.item_type.convert(item, param, ctx) for item in items)

@@ -278,8 +278,7 @@ def scalar_interval(
     lower and upper as floats. Raises ValueError for a negative count, SettingError for an alpha out
     of range.
     """
-    lower, upper = INTERVALS[interval](n_success, n_failure, alpha)
-    return float(lower), float(upper)
+    return INTERVALS[interval](n_success, n_failure, alpha)
 
 
 def _normal_interval(

@@ -90,7 +90,7 @@ class DecisionRule(nn.Module):
         self.reject_threshold = 1.0 - float(lower_bound)
         self.interval = interval
         error_level = SORTING_ERROR_LEVEL if self.sorts else float(alpha)
-        self.z = float(normal_quantile(error_level))
+        self.z = normal_quantile(error_level)
         self.scriptable = self.compiles and interval in SCALAR_BOUNDS
         in_python = partial(scalar_interval, interval, error_level)
         self.bound = SCALAR_BOUNDS.get(interval, in_python)

@@ -219,9 +219,7 @@ class CostCurve:
             """
             more = n_recordings / self.cycles
             bad, good = (
-                float(
-                    wilson_interval(more * size * rate, more * size * (1.0 - rate), ALPHA_EACH)[1]
-                )
+                wilson_interval(more * size * rate, more * size * (1.0 - rate), ALPHA_EACH)[1]
                 for size, rate in zip(sizes, rates, strict=True)
             )
             worst = self.costs.of_part(row.accepted, row.rejected, bad, good)
@@ -410,8 +408,7 @@ def needed_parts(policy: Policy) -> int:
     """
     if policy.guarantee == "local":
         counts = range(1, MOST_NEIGHBOURS)
-        level = policy.lower_bound
-        return 1 + bisect_left(counts, level, key=lambda n: float(policy.bound(n, 0)[0]))
+        return 1 + bisect_left(counts, policy.lower_bound, key=lambda n: policy.bound(n, 0)[0])
     if policy.guarantee == "pooled":
         evidence: Any = policy.rule().evidence
         steps: list[float] = evidence.level_steps[0]

@@ -102,7 +102,7 @@ def pooled_error(replays: Sequence[Any], side: str = "accepted", alpha: float = 
     if variance > 0.0 and 0.0 < rate < 1.0:
         n_effective = rate * (1.0 - rate) / variance
     lower, upper = wilson_interval(n_effective * rate, n_effective * (1.0 - rate), alpha)
-    return ErrorRate(n_decided, n_wrong, n_traces, rate, float(lower), float(upper))
+    return ErrorRate(n_decided, n_wrong, n_traces, rate, lower, upper)
 
 
 def _count_per_trace(replays: Sequence[Any], name: str, size: int) -> Floats:
