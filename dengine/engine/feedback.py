@@ -313,11 +313,9 @@ class Feedback:
             self._live.count_overdue(stored.decision)
         self._live.mark_examined_to(overdue_to)
 
-    def take_remedy(self) -> Remedy | None:
-        """Return, once, what must be put right after a wrong label; None if nothing must be."""
-        remedy = self.remedy
+    def clear_remedy(self) -> None:
+        """Forget what must be put right after a wrong label, because it is about to be done."""
         self.remedy = None
-        return remedy
 
     def retry_remedy(self, remedy: Remedy) -> None:
         """Put a remedy back that failed because the store is unavailable.

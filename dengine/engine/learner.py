@@ -159,11 +159,10 @@ class Learner:
         logged, and it is not tried again.
         """
         self.feedback.number_labels()
-        if self.feedback.remedy is None or not self._outbox.is_drained or self._outbox.fault:
+        remedy = self.feedback.remedy
+        if remedy is None or not self._outbox.is_drained or self._outbox.fault:
             return
-        remedy = self.feedback.take_remedy()
-        if remedy is None:
-            return
+        self.feedback.clear_remedy()
         try:
             if remedy is Remedy.CORRECT:
                 self.end_training()  # what is being trained does not have the correction
@@ -275,7 +274,7 @@ class Learner:
         is_due = n_new >= retrain_every and n_labels >= self.live.newest.min_traces
         # A training may have ended by its budget, as after a large import; then another begins
         # without new labels. Peers would each train the same version, so they wait for labels.
-        is_alone = self._peers is None and self._was_accepted
+        is_alone = peers is None and self._was_accepted
         lacks_steps = is_alone and self.live.lacks_steps and not (once and self._report is not None)
         if not (is_due or lacks_steps or self._is_requested):
             return None
