@@ -82,12 +82,12 @@ class Out:
     ----------
     path : Path
         A folder, or the file of the subcommand's only picture.
-    force : bool, default False
+    force : bool
         Replace files that exist.
     """
 
     path: Path
-    force: bool = False
+    force: bool
 
     def write(self, contents: Mapping[str, Any]) -> list[Path]:
         """Write files into the folder `path`, which is made if it is missing; return their paths.

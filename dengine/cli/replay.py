@@ -62,19 +62,19 @@ class Stream:
         Each gives a replay of every contender and policy.
     cycles : int or None
         Parts of a replay; None: all.
-    shuffle : bool, default True
+    shuffle : bool
         Whether the parts are shuffled, by the seed; False: in recorded order.
-    n_jobs : int, default 1
+    n_jobs : int
         Replays at a time, as joblib counts them.
     keep : Path or None
         Folder of finished replays, which are read from there and not played again.
     """
 
     seeds: range
-    cycles: int | None = None
-    shuffle: bool = True
-    n_jobs: int = 1
-    keep: Path | None = None
+    cycles: int | None
+    shuffle: bool
+    n_jobs: int
+    keep: Path | None
 
 
 def _play(
