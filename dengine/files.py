@@ -156,8 +156,10 @@ def read_archive(
             raise ValueError("the file is cut off")
         file.seek(0)
         archive = np.load(file, allow_pickle=False)
-        members = archive.zip.infolist()
-        sizes = {member.filename.removesuffix(".npy"): member.file_size for member in members}
+        sizes = {
+            member.filename.removesuffix(".npy"): member.file_size
+            for member in archive.zip.infolist()
+        }
         wanted = [key for key in sizes if names is None or key in names]
         check_size(sum(sizes[key] for key in wanted), title)
         return {key: np.asarray(archive[key]) for key in wanted}, list(sizes)

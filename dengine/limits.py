@@ -58,9 +58,8 @@ class ForceLimits:
     reject: bool = False
 
     def __post_init__(self) -> None:
-        numbers = (self.start, self.end, self.low, self.high)
         expect(
-            all(map(is_number, numbers))
+            all(map(is_number, (self.start, self.end, self.low, self.high)))
             and isinstance(self.reject, bool)
             and -math.inf < self.start <= self.end < math.inf
             and self.low <= self.high

@@ -167,8 +167,7 @@ def fit_starts_afresh(reducer: Any) -> None:
     B, labels_b = toy_traces(seed=2)
     once = as_reducer(clone(reducer), FOLDS).fit(B, labels_b)
     twice = as_reducer(clone(reducer), FOLDS).fit(A, labels_a).fit(B, labels_b)
-    points = np.asarray(twice.transform(A))
-    np.testing.assert_array_equal(points, np.asarray(once.transform(A)))
+    np.testing.assert_array_equal(np.asarray(twice.transform(A)), np.asarray(once.transform(A)))
 
 
 def any_length_and_several_channels_work(reducer: Any) -> None:

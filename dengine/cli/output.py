@@ -221,8 +221,9 @@ def table_of_rows(
     cells = [[*map(without_password, row)] for row in rows]
     is_short = all(len(row[0]) <= LONGEST_NAME for row in cells)
     for i, name in enumerate(columns):
-        no_wrap = is_short and i == 0
-        table.add_column(name, style="" if i else "bold", no_wrap=no_wrap, overflow="fold")
+        table.add_column(
+            name, style="" if i else "bold", no_wrap=is_short and i == 0, overflow="fold"
+        )
     for row in cells:
         table.add_row(*row)
     return table

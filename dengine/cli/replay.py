@@ -348,8 +348,10 @@ def _replay_and_print(
         "interrupted": error is not None,
         "costs": {"seconds": seconds, "kept": n_kept},
     }
-    legend = legend_or_hint(tables.LEGEND)
-    parts = [tables.pooled_table(rows, title, legend), *tables.promise_lines(rows)]
+    parts = [
+        tables.pooled_table(rows, title, legend_or_hint(tables.LEGEND)),
+        *tables.promise_lines(rows),
+    ]
     for name, group in by_name.items():
         retrains = [retrain for replay in group for retrain in replay.retrains]
         parts.append(f"{name}: {tables.retrain_line(retrains)}")
@@ -624,8 +626,7 @@ def _cost_cells(row: PolicyCost, is_chosen: bool) -> tuple[str, ...]:
     their shares.
     """
     policy = row.policy
-    is_local = policy.guarantee == "local"
-    rule = f"alpha {policy.alpha:g}" if is_local else policy.guarantee
+    rule = f"alpha {policy.alpha:g}" if policy.guarantee == "local" else policy.guarantee
     return (
         f"> {rule}" if is_chosen else rule,
         "-" if policy.guarantee == "cost" else percent(policy.lower_bound, "g"),

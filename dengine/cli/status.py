@@ -127,8 +127,9 @@ def _present_rows(report: "Status") -> list[tuple[str, str]]:
     rows.append(("cell", report.cell))
     shown = report
     if not report.recipe.policy.audit_rate:
-        reasons = _without_audits(report.reasons)
-        shown = replace(report, reasons=reasons, sources=_without_audits(report.sources))
+        shown = replace(
+            report, reasons=_without_audits(report.reasons), sources=_without_audits(report.sources)
+        )
     rows += field_rows(shown, "cell", *SHOWN_ELSEWHERE, *ONLY_WHILE_RUNNING)
     if report.model is None:
         # The recipe has no effect on a model that was handed in.

@@ -63,8 +63,12 @@ def normal_quantile(alpha: float) -> float:
     SettingError
         If alpha is not between 0 and 1, or so small that 1 - alpha / 2 rounds to 1.
     """
-    valid = 0.0 < alpha / 2.0 < 1.0 - alpha / 2.0 < 1.0
-    expect(valid, "0 < alpha < 1", alpha, "0.05 asks for a 95 % interval")
+    expect(
+        0.0 < alpha / 2.0 < 1.0 - alpha / 2.0 < 1.0,
+        "0 < alpha < 1",
+        alpha,
+        "0.05 asks for a 95 % interval",
+    )
     return NormalDist().inv_cdf(1.0 - alpha / 2.0)
 
 

@@ -116,8 +116,11 @@ class Policy:
                 object.__setattr__(self, name, default)
         for name in ("alpha", "lower_bound", "audit_rate"):
             expect(is_number(getattr(self, name)), f"a number as {name}", getattr(self, name))
-        is_text = isinstance(self.guarantee, str)
-        expect(is_text, "a guarantee's name, or module:Class as text", self.guarantee)
+        expect(
+            isinstance(self.guarantee, str),
+            "a guarantee's name, or module:Class as text",
+            self.guarantee,
+        )
         normal_quantile(self.alpha)
         expect(
             0.5 < self.lower_bound < 1.0,
@@ -125,25 +128,37 @@ class Policy:
             self.lower_bound,
             "0.95 tolerates 5 % of errors",
         )
-        has_interval = isinstance(self.interval, str) and self.interval in INTERVALS
-        expect(has_interval, f"an interval among {', '.join(INTERVALS)}", self.interval)
+        expect(
+            isinstance(self.interval, str) and self.interval in INTERVALS,
+            f"an interval among {', '.join(INTERVALS)}",
+            self.interval,
+        )
         expect(
             0.0 <= self.audit_rate <= 1.0,
             "0 <= audit_rate <= 1",
             self.audit_rate,
             "0.02 checks one part in fifty",
         )
-        has_rule = ":" in self.guarantee or self.guarantee in RULES
-        expect(has_rule, f"a guarantee among {', '.join(RULES)}, or module:Class", self.guarantee)
+        expect(
+            ":" in self.guarantee or self.guarantee in RULES,
+            f"a guarantee among {', '.join(RULES)}, or module:Class",
+            self.guarantee,
+        )
         choices = get_args(Stops)
         expect(self.stops in choices, f"stops {' or '.join(choices)}", self.stops)
         expect(isinstance(self.shadow, bool), "shadow to be True or False", self.shadow)
-        is_count = is_whole(self.label_within, 1, 10**9)
-        expect(is_count, "label_within of at least one decision", self.label_within)
+        expect(
+            is_whole(self.label_within, 1, 10**9),
+            "label_within of at least one decision",
+            self.label_within,
+        )
         object.__setattr__(self, "force_limits", self._checked_limits())
         object.__setattr__(self, "prices", self._checked_prices())
-        claims_members = self.guarantee in SORTING_GUARANTEES
-        if claims_members and self.stops == "some" and self.audited_share == 0.0:
+        if (
+            self.guarantee in SORTING_GUARANTEES
+            and self.stops == "some"
+            and self.audited_share == 0.0
+        ):
             raise SettingError(
                 f"Expected audits, or stops='all', beside the {self.guarantee} guarantee, which "
                 "can claim nothing of parts that nobody hears of; set audit_rate=0.1, or "
@@ -204,8 +219,7 @@ class Policy:
         missing audit rate, guarantee or `prices` follow from the other settings, as in the class.
         Raises SettingError for a value out of its range.
         """
-        names = [field.name for field in fields(cls)]
-        settings = {name: values[name] for name in names if name in values}
+        settings = {f.name: values[f.name] for f in fields(cls) if f.name in values}
         limits = values.get("force_limits", values.get(OLD_NAME, NO_LIMITS))
         settings["force_limits"] = () if limits == NO_LIMITS else tuple(limits.split())
         return cls(**settings)
@@ -326,8 +340,9 @@ class Policy:
         if self.stops == "all":
             bad = outcomes.false_accepts + outcomes.forgotten_accepts
             outcomes = replace(outcomes, accepted=bad + outcomes.confirmed)
-        tolerance = self.tolerances[0]
-        certificate = certify(outcomes, self.alpha, tolerance, self.stops, self.audited_share)
+        certificate = certify(
+            outcomes, self.alpha, self.tolerances[0], self.stops, self.audited_share
+        )
         if self.guarantee == "cost":
             certificate = replace(certificate, prices=self.prices)
         return certificate
@@ -359,5 +374,8 @@ def check_radius(radius: float) -> None:
 
     It is the distance, in units of the scaled embedding, within which labels count.
     """
-    is_valid = is_number(radius) and 0.0 < radius <= LARGEST_RADIUS
-    expect(is_valid, f"a radius > 0 of at most {LARGEST_RADIUS:g}", radius)
+    expect(
+        is_number(radius) and 0.0 < radius <= LARGEST_RADIUS,
+        f"a radius > 0 of at most {LARGEST_RADIUS:g}",
+        radius,
+    )

@@ -92,8 +92,7 @@ class DecisionRule(nn.Module):
         error_level = SORTING_ERROR_LEVEL if self.sorts else float(alpha)
         self.z = normal_quantile(error_level)
         self.scriptable = self.compiles and interval in SCALAR_BOUNDS
-        in_python = partial(scalar_interval, interval, error_level)
-        self.bound = SCALAR_BOUNDS.get(interval, in_python)
+        self.bound = SCALAR_BOUNDS.get(interval, partial(scalar_interval, interval, error_level))
         self.extra_arguments: tuple[Any, ...] = ()
 
     def forward(self, n_success: int, n_failure: int) -> tuple[int, float, float]:
@@ -169,8 +168,7 @@ class DecisionRule(nn.Module):
     @torch.jit.unused
     def clone(self) -> Self:
         """Return a rule with the same settings that has learned nothing."""
-        settings = (self.alpha, self.accept_threshold, self.interval)
-        return type(self)(*settings, *self.extra_arguments)
+        return type(self)(self.alpha, self.accept_threshold, self.interval, *self.extra_arguments)
 
     @torch.jit.unused
     def learns(self) -> bool:

@@ -101,8 +101,9 @@ def register_tensors(module: nn.Module) -> None:
 
 def module_state(module: nn.Module, prefix: str) -> State:
     """Return copies of a module's parameters and buffers as arrays, by `prefix` and their name."""
-    tensors = module.state_dict()
-    return {f"{prefix}{name}": tensor.numpy().copy() for name, tensor in tensors.items()}
+    return {
+        f"{prefix}{name}": tensor.numpy().copy() for name, tensor in module.state_dict().items()
+    }
 
 
 def arrays_with_prefix(state: Arrays, prefix: str) -> State:

@@ -120,8 +120,8 @@ class Candidate:
         Without a model it stays that of a dropped retrain, with the number of the version in force.
         Seconds after this call are in no report.
         """
-        seconds = self._clock() - self._begin  # storing it comes on top
-        self.report = replace(self.report, seconds=seconds)
+        # Storing it comes on top.
+        self.report = replace(self.report, seconds=self._clock() - self._begin)
         if self.model is not None:
             self.report = replace(self.report, version=version, accepted=True)
         return self.report

@@ -202,8 +202,9 @@ class Corrections:
         changes = {id_: {"was": label, "now": None} for id_, label in labels.items()}
         data = {"decisions": changes, "reason": reason}
         live = self._live
-        has_seen = live.trained_on.has_seen
-        if live.pinned and any(has_seen(stored.label_seq or 0) for stored in forgotten):
+        if live.pinned and any(
+            live.trained_on.has_seen(stored.label_seq or 0) for stored in forgotten
+        ):
             text += f"; version {live.version}, which learned from this, is pinned no more"
             self._learner.release(author)
         return self._change_labels(Change("forget", text, data, author, tuple(labels), None))

@@ -266,8 +266,7 @@ class DecisionMaker:
             TraceSpec(samples=x.shape[1], channels=x.shape[0])
         )
         if verify_reason is not None:
-            unlimited = replace(conditions, force_limits=())
-            verdict = _verify(x, unlimited, verify_reason)
+            verdict = _verify(x, replace(conditions, force_limits=()), verify_reason)
         elif model is None:
             verdict = _verify(x, conditions, Reason.NO_MODEL)
         else:
@@ -326,8 +325,7 @@ def check_same_trace(stored: StoredDecision, trace: Any, spec: TraceSpec | None)
     TraceError
         For a trace that does not fit `spec`, and for values that are no real numbers.
     """
-    x = as_trace(trace, spec)
-    if not np.array_equal(x, stored.trace, equal_nan=True):
+    if not np.array_equal(as_trace(trace, spec), stored.trace, equal_nan=True):
         raise TraceConflictError(
             f"Expected the trace that decision {stored.decision.id!r} was made on, got another; "
             "give it an id of its own."

@@ -903,8 +903,9 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         """
         self.flush()
         policy = self.policy
-        since = self._settings.now.policy_since
-        tally = self.store.decisions.tally(since_version=since, within=policy.label_within)
+        tally = self.store.decisions.tally(
+            since_version=self._settings.now.policy_since, within=policy.label_within
+        )
         return policy.certificate(tally.outcomes)
 
     # Reading

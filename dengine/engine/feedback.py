@@ -303,8 +303,7 @@ class Feedback:
         logged, and the rule is stale then. `LiveModel.overdue_to` becomes the newest number that
         was examined; nothing changes if that is not larger than before.
         """
-        label_within = self._settings.now.recipe.policy.label_within
-        overdue_to = self._outbox.n_decisions - label_within
+        overdue_to = self._outbox.n_decisions - self._settings.now.recipe.policy.label_within
         if overdue_to <= self._live.overdue_to:
             return
         pending = self._awaiting_check

@@ -119,8 +119,9 @@ class Learner:
         """Read the training window from the store, with corrections up to this number, and count
         the new labels again.
         """
-        capacity = self._window.capacity
-        self._window.refill(self._store.labels.with_traces(capacity, corrected_to=corrected_to))
+        self._window.refill(
+            self._store.labels.with_traces(self._window.capacity, corrected_to=corrected_to)
+        )
         self.feedback.count_new_labels(self.live.trained_on.counts_from)
 
     def precompute(self) -> None:
@@ -429,9 +430,10 @@ class Learner:
             if not candidate.is_stored:  # it would be gone with the process
                 self._drop(candidate, error)
                 return
-            version = candidate.report.version
             log.warning(
-                "version %d is stored, and answers once the labels since are: %s", version, error
+                "version %d is stored, and answers once the labels since are: %s",
+                candidate.report.version,
+                error,
             )
         candidate.end_work()
 
@@ -743,8 +745,9 @@ class Learner:
         empties `dropped`. If the version cannot be stored, also because another cell of the product
         stored a version meanwhile, StoreError is raised and nothing changes.
         """
-        n_traces = len(trained_on.seq)
-        report = RetrainReport(self.live.next_version, seconds, n_traces, 0, True, reason)
+        report = RetrainReport(
+            self.live.next_version, seconds, len(trained_on.seq), 0, True, reason
+        )
         state = self.live.get_state(model, trained_on)
         self._store.corrections.apply(
             replace(event, version=(report, self._window.newest_seq, state))

@@ -279,9 +279,8 @@ class LiveModel:
         (its hash chain) is not checked here. Raises StoreError, and changes nothing, if the store
         is unavailable.
         """
-        store = self.outbox.store
         outcomes = self.outbox.call_store(
-            lambda: store.labels.outcomes_since(0, self.evidence.since, self.overdue_to)
+            lambda: self.outbox.store.labels.outcomes_since(0, self.evidence.since, self.overdue_to)
         )
         self._start_rule(outcomes)
 

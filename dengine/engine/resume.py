@@ -184,8 +184,7 @@ def add_labels_since(
         while corrections and corrections[0].newest_seq < seq:
             apply_correction(model, store, corrections.popleft())
         # The point is unknown where an earlier version answered the decision.
-        point = points.get(seq)
-        guarded(NO_REFERENCE, model.add_reference, trace, label, hash_, seq, point=point)
+        guarded(NO_REFERENCE, model.add_reference, trace, label, hash_, seq, point=points.get(seq))
     for correction in corrections:
         apply_correction(model, store, correction)
     return newest
@@ -229,6 +228,5 @@ def apply_correction(model: EngineModel, store: SqlStore, correction: Correction
         return model.change_reference(correction.seq, hash_, label)
     model.change_reference(correction.seq, hash_, None)  # a version of a peer may have it already
     if len(data.seq):
-        trace = data.traces[0]
-        guarded(NO_REFERENCE, model.add_reference, trace, label, hash_, correction.seq)
+        guarded(NO_REFERENCE, model.add_reference, data.traces[0], label, hash_, correction.seq)
     return True

@@ -189,8 +189,12 @@ class TrainedOn:
 
         Arrays of other names are ignored. Raises KeyError if another of the four is missing.
         """
-        pinned = int(state.get("pinned", 0))
-        return cls(state["trained_on"], int(state["trained_as"]), int(state["counts_from"]), pinned)
+        return cls(
+            state["trained_on"],
+            int(state["trained_as"]),
+            int(state["counts_from"]),
+            int(state.get("pinned", 0)),
+        )
 
 
 @dataclass(frozen=True)
@@ -304,9 +308,12 @@ class Retrainer:
         remembered: the longest of the newest 20 is reserved in the time budget of the next. This
         thread then has one torch thread.
         """
-        data = self.window.snapshot()
         trained = train_candidate(
-            current.successor(), data, self._step_seconds(), self.max_steps, self.clock
+            current.successor(),
+            self.window.snapshot(),
+            self._step_seconds(),
+            self.max_steps,
+            self.clock,
         )
         self._last_seconds.append(trained.last_seconds)
         return replace(trained, begin=begin)

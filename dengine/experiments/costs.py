@@ -315,8 +315,10 @@ class CostCurve:
         names = {f"policy_{name}": name for name in ("guarantee", "alpha", "lower_bound")}
         others = [name for name in frame if not name.startswith("policy_")]
         frame = frame[[*names, *others]].rename(columns=names)
-        chosen = [row.policy == self.policy for row in rows]
-        return frame.assign(chosen=chosen, reported=[row in self.rows for row in rows])
+        return frame.assign(
+            chosen=[row.policy == self.policy for row in rows],
+            reported=[row in self.rows for row in rows],
+        )
 
 
 def policy_name(policy: Policy) -> str:
@@ -344,8 +346,7 @@ def settings_of(policy: Policy) -> dict[str, Any]:
     if policy.guarantee == "cost":
         names = ["prices"]
     settings = {name: getattr(policy, name) for name in names}
-    default = Policy(**settings, stops="all")
-    if policy.audit_rate != default.audit_rate:
+    if policy.audit_rate != Policy(**settings, stops="all").audit_rate:
         settings["audit_rate"] = policy.audit_rate
     return settings | ({"stops": "all"} if policy.stops == "all" else {})
 

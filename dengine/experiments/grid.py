@@ -400,8 +400,7 @@ def run_grid(
     ----------
     The paper's experiments: 30 shuffled repeats of a 3 x 3 grid.
     """
-    seeds = range(repeats)
-    tasks = grid_tasks(recipes, alphas, lower_bounds, intervals, seeds, cycles=cycles)
+    tasks = grid_tasks(recipes, alphas, lower_bounds, intervals, range(repeats), cycles=cycles)
     return frame_of(play_tasks(dataset, tasks, n_jobs=n_jobs, keep=keep))
 
 
@@ -445,8 +444,9 @@ def grid_tasks(
     combinations = product(load_contenders(recipes), intervals, alphas, lower_bounds)
     tasks = []
     for contender, *settings in combinations:
-        pairs = zip(names, settings, strict=True)
-        changes = {name: value for name, value in pairs if value is not None}
+        changes = {
+            name: value for name, value in zip(names, settings, strict=True) if value is not None
+        }
         changed = contender.with_policy(**changes)
         tasks += [Task(changed, seed, cycles, shuffle) for seed in seeds]
     return tasks

@@ -92,8 +92,7 @@ def signature(content: bytes, key: FilePath) -> str:
     Line breaks at the end of the file do not belong to the secret. Raises ExportError for a file
     that cannot be read, or whose secret has less than 16 bytes.
     """
-    secret = read_key(key, ExportError)
-    return PREFIX + hmac.new(secret, content, hashlib.sha256).hexdigest()
+    return PREFIX + hmac.new(read_key(key, ExportError), content, hashlib.sha256).hexdigest()
 
 
 def sibling_path(path: FilePath, suffix: str) -> Path:
@@ -312,8 +311,7 @@ def write_export(
     digest = hashlib.sha256(content).hexdigest()
     files = {target: content, sibling_path(target, "sha256"): f"{digest}  {target.name}\n".encode()}
     if key is not None:
-        line = f"{signature(content, key)}  {target.name}\n"
-        files[sibling_path(target, "sig")] = line.encode()
+        files[sibling_path(target, "sig")] = f"{signature(content, key)}  {target.name}\n".encode()
     _check_outputs(target, force)
     if source is not None and source.note is not None:
         source.note("export", f"{digest} {target.name}, version {source.model_version}")

@@ -232,8 +232,7 @@ def _parse_part(words: list[str], spec: TraceSpec) -> JournalLine:
     )
     trace = np.zeros((1, 0), dtype=np.float32)
     if decision.action is not Action.REJECT:
-        values = np.array(samples, dtype=np.float32)
-        trace = as_trace(values.reshape(spec.channels, -1), spec)
+        trace = as_trace(np.array(samples, dtype=np.float32).reshape(spec.channels, -1), spec)
     return JournalLine(decision, trace, LABELS[label])
 
 

@@ -212,8 +212,9 @@ class OnnxModel:
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = options.inter_op_num_threads = 1
         options.log_severity_level = 3
-        providers = ["CPUExecutionProvider"]
-        self.session = onnxruntime.InferenceSession(content, options, providers=providers)
+        self.session = onnxruntime.InferenceSession(
+            content, options, providers=["CPUExecutionProvider"]
+        )
         self.metadata = metadata
         self.trace = TraceSpec(**metadata["trace"])
         self.decide(golden_trace(self.trace))  # warms it up
@@ -227,8 +228,7 @@ class OnnxModel:
         labels, and its reason says so; the embedding of a faulty trace is NaN. Raises TraceError
         for a wrong shape, a T that is refused, and values that are no real numbers.
         """
-        outputs = self.session.run(None, {"trace": as_trace(trace, self.trace)})
-        action, reason, *counted, z = outputs
+        action, reason, *counted, z = self.session.run(None, {"trace": as_trace(trace, self.trace)})
         numbers = (value.item() for value in counted)
         return ExportedDecision._make((ACTIONS[action], REASONS[reason], *numbers, z))
 
@@ -259,8 +259,7 @@ class OnnxDecision(nn.Module):
         points = np.full((model.n_spaces, index.dim, len(index)), FAR, dtype=np.float32)
         points[index.column("spaces"), :, np.arange(len(index))] = index.column("points")
         self.register_buffer("points", torch.from_numpy(points))
-        labels = index.column("labels").astype(np.int64)
-        self.register_buffer("labels", torch.from_numpy(labels))
+        self.register_buffer("labels", torch.from_numpy(index.column("labels").astype(np.int64)))
 
     def forward(self, trace: Tensor) -> tuple[Tensor, ...]:
         """Decide on one trace (C, T) of float32; return a tuple of seven tensors.

@@ -362,8 +362,9 @@ class ModelPrediction(EngineModel):
             interval=policy.interval,
             capacity=recipe.window,
         )
-        reducer = recipe.make_reducer(seed)
-        return cls(reducer, classifier, recipe.folds, policy.rule(), recipe.novelty)
+        return cls(
+            recipe.make_reducer(seed), classifier, recipe.folds, policy.rule(), recipe.novelty
+        )
 
     @property
     def user_model(self) -> "ModelPrediction":  # an attribute would be a reference circle
@@ -607,8 +608,7 @@ class ModelPrediction(EngineModel):
         also what `build_decider` raises, if no decider is kept.
         """
         X = as_traces(np.asarray(x)[None], self.trace_spec)
-        hash_ = int(content_hash(X)[0])
-        self.add_reference(X[0], int(as_success(np.asarray(y))), hash_)
+        self.add_reference(X[0], int(as_success(np.asarray(y))), int(content_hash(X)[0]))
         return self
 
     def add_reference(
@@ -857,8 +857,7 @@ class ModelPrediction(EngineModel):
         Returns why the model must not be used, "" if it may be used. Call `defect` before. Raises
         what `build_decider` raises, and what the decider raises.
         """
-        decider = self.decider(self._conditions)
-        return compare_points(decider, self.examples, self._example_points)
+        return compare_points(self.decider(self._conditions), self.examples, self._example_points)
 
     def get_state(self) -> State:
         """Return the state as arrays by name, which `set_state` takes.

@@ -79,8 +79,7 @@ def read_tokens(file: Path) -> tuple[Token, ...]:
         text = opened.read(1 << 16)
     # From version 254 on, systemd gives a credential to the service's user by an ACL, which shows
     # as a permission of the group.
-    credentials = os.environ.get("CREDENTIALS_DIRECTORY", "")
-    is_credential = file.absolute().parent == Path(credentials)
+    is_credential = file.absolute().parent == Path(os.environ.get("CREDENTIALS_DIRECTORY", ""))
     has_owners = hasattr(os, "getuid")  # on Windows the mode does not say who may read
     if has_owners and mode & (0o037 if is_credential else 0o077):
         raise SettingError(

@@ -71,8 +71,7 @@ async def drive(service: CellService, cell: ReplayCell) -> None:
         for cycle in range(len(cell.order)):
             seconds = 0.0 if cycle < N_FAST else SECONDS
             next_start = max(next_start + seconds, loop.time())
-            trace = cell.insert()
-            decision = (await service.decide(trace, part=f"{cycle + 1:04d}")).decision
+            decision = (await service.decide(cell.insert(), part=f"{cycle + 1:04d}")).decision
             await asyncio.sleep(seconds * CHECK_SHARE)
             stopped = decision.action is Action.ACCEPT and cell.proceed() is Outcome.STOPPED
             if decision.action is Action.VERIFY or stopped:

@@ -55,8 +55,7 @@ class RetrainingProcess(Executor):
         `ready` is set to a new future, which is done when the modules are imported, and fails if
         they cannot be or the process ends before. Raises OSError if the process cannot be started.
         """
-        context = multiprocessing.get_context("spawn")
-        self._pool = ProcessPoolExecutor(1, context, _prepare_process)
+        self._pool = ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), _prepare_process)
         other_processes = set(multiprocessing.active_children())
         self.ready = self._pool.submit(_warm_up)
         (self._process,) = set(multiprocessing.active_children()) - other_processes

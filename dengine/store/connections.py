@@ -68,9 +68,10 @@ def make_engine(url: str | None) -> sa.Engine:
         password.
     """
     if url is None:
-        arguments = {"check_same_thread": False}
         return _with_sqlite_events(
-            sa.create_engine("sqlite://", poolclass=sa.pool.StaticPool, connect_args=arguments)
+            sa.create_engine(
+                "sqlite://", poolclass=sa.pool.StaticPool, connect_args={"check_same_thread": False}
+            )
         )
     expect(
         as_text(url) == url,

@@ -90,8 +90,9 @@ class RecordInsertion:
         decisions = [record for record in records if isinstance(record, StoredDecision)]
         labels = [record for record in records if isinstance(record, NewLabel)]
         problems = self._insert_decisions(connection, decisions)
-        ids = [label.decision_id for label in labels]
-        stored = self._corrections.stored_labels(connection, ids)
+        stored = self._corrections.stored_labels(
+            connection, [label.decision_id for label in labels]
+        )
         new: dict[str, NewLabel] = {}
         labelled: dict[str, None] = {}  # decisions that have the label that is reported
         late_stops: dict[str, None] = {}
@@ -133,8 +134,9 @@ class RecordInsertion:
         """
         trace_columns = TRACE.c["decision_id", "channels", "samples", "data"]
         query = sa.select(*DECISION.c, *trace_columns).select_from(WITH_TRACES)
-        ids = [item.decision.id for item in decisions]
-        stored = self._database.rows_by_id(connection, query, ids)
+        stored = self._database.rows_by_id(
+            connection, query, [item.decision.id for item in decisions]
+        )
         new = []
         problems = []
         for item in decisions:

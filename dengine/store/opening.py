@@ -72,8 +72,12 @@ def open_store(
         return store
     if store is None:
         return SqlStore()
-    is_name = isinstance(store, str | os.PathLike)
-    expect(is_name, "None, a file, a URL or an SqlStore", store, error=StoreError)
+    expect(
+        isinstance(store, str | os.PathLike),
+        "None, a file, a URL or an SqlStore",
+        store,
+        error=StoreError,
+    )
     url = store if isinstance(store, CellAddress) else CellAddress(os.fspath(store), "cell")
     if must_exist:
         check_cell_exists(url, url.cell_id)

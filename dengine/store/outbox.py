@@ -220,8 +220,9 @@ class Outbox(ABC):
 
     def _completed(self, item: StoredDecision, label: NewLabel) -> NewLabel:
         """Return a copy of a label with the present time, and its decision's hash and time."""
-        hash_ = item.content_hash
-        return replace(label, time=self.store.clock(), content_hash=hash_, decided=item.time)
+        return replace(
+            label, time=self.store.clock(), content_hash=item.content_hash, decided=item.time
+        )
 
     @abstractmethod
     def record_event(self, kind: str, text: str) -> None:

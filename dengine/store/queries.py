@@ -97,8 +97,9 @@ class Scope:
         If the cell has a product, the rows of all cells of the product count. With `conditions`,
         only over the rows that fulfil them all. 0 if there is none.
         """
-        is_own = column.table.c.cell_id == self.cell_id
-        query = sa.select(sa.func.max(column)).where(is_own, *conditions)
+        query = sa.select(sa.func.max(column)).where(
+            column.table.c.cell_id == self.cell_id, *conditions
+        )
         if self.product is not None:
             query = newest_of(self.product, column, *conditions)
         return connection.execute(query).scalar() or 0

@@ -282,8 +282,9 @@ class LabelledTraces:
         Each item is (number of the label, trace of shape (C, T), label, content hash); all but the
         trace are Python integers.
         """
-        lists = (self.labels.tolist(), self.hashes.tolist())
-        return zip(self.seq.tolist(), self.traces, *lists, strict=True)
+        return zip(
+            self.seq.tolist(), self.traces, self.labels.tolist(), self.hashes.tolist(), strict=True
+        )
 
 
 class OutcomeRecord(NamedTuple):

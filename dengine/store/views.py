@@ -61,8 +61,11 @@ class HistoryFilter:
         """Raise SettingError for an action, predicted, reason or label that is not in OPTIONS."""
         for name, options in OPTIONS.items():
             value = getattr(self, name)
-            is_valid = value is None or value in options
-            expect(is_valid, f"{name} to be one of {', '.join(options)}", value)
+            expect(
+                value is None or value in options,
+                f"{name} to be one of {', '.join(options)}",
+                value,
+            )
 
 
 @dataclass(frozen=True, slots=True)
