@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 Command = Callable[..., Any]
 Option = Callable[[Command], Command]
 Options = Mapping[str, Any]  # the values of options, by name
+Values = dict[str, Any]  # the same, to be changed
 FILE = click.Path(dir_okay=False, path_type=Path)
 FOLDER = click.Path(file_okay=False, path_type=Path)
 COUNT = click.IntRange(1)
@@ -190,7 +191,7 @@ def bundle_options(into: str, make: Callable[..., Any], options: Mapping[str, Op
     return decorate
 
 
-def drop_none(**values: Any) -> dict[str, Any]:
+def drop_none(**values: Any) -> Values:
     """Return the options that were given, by name: those whose value is not None.
 
     False, 0 and "" were given, too.
@@ -624,7 +625,7 @@ DATA = CHOICE | {
 }
 
 
-def parse_stated(items: Iterable[str]) -> dict[str, Any]:
+def parse_stated(items: Iterable[str]) -> Values:
     """Return the values of `--set KEY=VALUE` by their keys, which stay texts like `label.column`.
 
     A value is read as TOML; if it is not valid TOML, it is the text itself. Only the first `=` of
@@ -632,7 +633,7 @@ def parse_stated(items: Iterable[str]) -> dict[str, Any]:
     value counts. Whether there is such a key is not checked. Raises click.UsageError for an item
     without `=`.
     """
-    stated = dict[str, Any]()
+    stated = Values()
     for item in items:
         name, mark, text = item.partition("=")
         if not mark:
@@ -667,7 +668,7 @@ def data_options(
     if argument:
         data = click.argument("data", metavar=metavar)
     else:
-        need: dict[str, Any] = {"required": True} if default is None else {"default": default}
+        need: Values = {"required": True} if default is None else {"default": default}
         data = click.option(
             "--data",
             metavar=metavar,
@@ -689,8 +690,8 @@ def data_options(
     )
 
 
-def recorder_settings(options: Options) -> tuple[dict[str, Any], TraceSpec]:
-    """Return the settings of an `RtdeRecorder`, by its argument names, and its `TraceSpec`.
+def recorder_settings(options: Options) -> tuple[Values, TraceSpec]:
+    """Return the settings of an `RtdeValueser`, by its argument names, and its `TraceSpec`.
 
     They come from the values of `--samples`, `--channels`, `--rate-hz`, `--unit` and `--fit` in
     `options`, by the names in `TRACE`, as far as they were given; other options are ignored. The

@@ -216,13 +216,14 @@ def table_of_rows(
     from rich.markup import escape
     from rich.table import Table
 
-    title = escape(without_password(title))
-    table = Table(title=title, show_header=any(columns), title_justify="left")
+    table = Table(
+        title=escape(without_password(title)), show_header=any(columns), title_justify="left"
+    )
     cells = [[*map(without_password, row)] for row in rows]
     is_short = all(len(row[0]) <= LONGEST_NAME for row in cells)
     for i, name in enumerate(columns):
         table.add_column(
-            name, style="" if i else "bold", no_wrap=is_short and i == 0, overflow="fold"
+            name, style="" if i else "bold", no_wrap=is_short and not i, overflow="fold"
         )
     for row in cells:
         table.add_row(*row)

@@ -29,6 +29,7 @@ MOST_BYTES = 1_000_000
 ORDERS = {"name", "path", "time"}  # any other `order` is a column
 Words = tuple[str, ...]
 Stated = Mapping[str, Any]
+Values = dict[str, Any]  # of keys, by name
 
 
 @dataclass(frozen=True, slots=True)
@@ -366,7 +367,7 @@ class Description:
         """
         return write_output(path, self.to_toml().encode(errors="replace"), force)
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> Values:
         """Return nested dicts of TOML's types, without the notes and without default values.
 
         The channels are always there, each with its unit; if there are none, `?` stands for them.
@@ -476,7 +477,7 @@ class Description:
 
 
 # The sections, in the order of the file, and what their tables are made of; None: texts.
-SECTIONS: dict[str, Any] = {
+SECTIONS: Values = {
     "text": TextForm,
     "rows": RowWords,
     "time": Clock,
@@ -584,14 +585,14 @@ def _plain(value: Any) -> Any:
     return {k: _plain(v) for k, v in values.items() if v != getattr(default, k)}
 
 
-def flat(prefix: str, value: Mapping[str, Any]) -> dict[str, Any]:
+def flat(prefix: str, value: Mapping[str, Any]) -> Values:
     """Return a nested mapping as one dict: `{"a": {"b": 1}}` becomes `{"a.b": 1}`.
 
     An empty mapping within it is left out. If two keys become equal, the later one counts.
 
     prefix : text that is put before each key; no dot is added. value : the mapping.
     """
-    items: dict[str, Any] = {}
+    items: Values = {}
     for name, item in value.items():
         if isinstance(item, Mapping):
             items |= flat(f"{prefix}{name}.", item)

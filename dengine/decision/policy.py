@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from .rule import DecisionRule
 
 Stops = Literal["all", "some"]
+Settings = dict[str, Any]  # of a policy, by name
 RULES = {  # names in `member_rules`, by guarantee and by which line stops are known
     "local": {"some": "DecisionRule", "all": "WatchedRule"},
     "pooled": {"some": "PooledRule", "all": "PooledRule"},
@@ -201,7 +202,7 @@ class Policy:
         check, escape, false_reject = prices
         return check, escape, false_reject
 
-    def to_values(self) -> dict[str, Any]:
+    def to_values(self) -> Settings:
         """Return every setting by its name; the force limits are one text, "none" without any.
 
         In this text a space separates two limits. All other values stay as they are, so `prices` is
@@ -232,7 +233,7 @@ class Policy:
         becomes 0.05, unless the settings have an audit rate. Raises SettingError for a value out of
         its range, TypeError for a name that is no setting.
         """
-        implied: dict[str, Any] = {}
+        implied: Settings = {}
         has_prices_alone = settings.keys() & {"prices", "guarantee"} == {"prices"}
         if has_prices_alone and self.guarantee in ("local", "pooled"):
             implied = {"guarantee": "cost", "audit_rate": self.audit_rate or AUDIT_RATE}
@@ -307,7 +308,7 @@ class Policy:
             raise SettingError(
                 f"Expected a subclass of DecisionRule as guarantee, {self.guarantee} is none."
             )
-        options: dict[str, Any] = {}
+        options: Settings = {}
         if issubclass(rule_class, member_rules.PricedRule):
             options["tolerances"] = self.tolerances
         if issubclass(rule_class, member_rules.PooledRule | member_rules.PricedRule):

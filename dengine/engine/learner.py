@@ -36,6 +36,8 @@ from .trainer import Clock, Retrainer, Trained, TrainedOn, TrainingWindow
 # So many labels without any retrain were imported, and the first training is worth preparing.
 IMPORTED = 500
 PATIENCE = 20  # steps that a candidate leaves to the thread that stores its labels
+# Of a candidate; each yields None, or a function that waits for the store.
+Steps = Iterator[Callable[[], object] | None]
 
 
 class Learner:
@@ -82,7 +84,7 @@ class Learner:
         self._retrainer = retrainer
         self._clock = clock
         self._candidate: Candidate | None = None
-        self._steps: Iterator[Callable[[], object] | None] = iter(())  # of the candidate
+        self._steps: Steps = iter(())  # of the candidate
         self._report: RetrainReport | None = None  # of the newest retrain, until it is taken
         self._was_accepted = True  # the last retrain
         self._precomputed: Future[None] | None = None  # what the next retrain begins with
@@ -437,7 +439,7 @@ class Learner:
             )
         candidate.end_work()
 
-    def _see_through(self, candidate: Candidate) -> Iterator[Callable[[], object] | None]:
+    def _see_through(self, candidate: Candidate) -> Steps:
         """Generate the steps of a candidate from its training until it is in force.
 
         It is tested first, so that a model that fails the test is never written to the store. It is
@@ -462,7 +464,7 @@ class Learner:
         yield from self._catch_up_candidate(candidate)
         self._swap(candidate)
 
-    def _catch_up_candidate(self, candidate: Candidate) -> Iterator[Callable[[], object] | None]:
+    def _catch_up_candidate(self, candidate: Candidate) -> Steps:
         """Add all labels that it lacks to the candidate's references, and have them stored.
 
         The candidate is a trained version that is not in force yet; a label that it cannot take is

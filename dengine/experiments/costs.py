@@ -33,7 +33,7 @@ from scipy.stats import t as student
 
 from ..datasets import Dataset, load_dataset
 from ..decision.intervals import normal_quantile, wilson_interval
-from ..decision.policy import AUDIT_RATE, RULES, Policy
+from ..decision.policy import AUDIT_RATE, RULES, Policy, Settings
 from ..errors import SettingError, amount, expect, percent
 from ..files import FilePath
 from ..records import Floats
@@ -334,7 +334,7 @@ def policy_name(policy: Policy) -> str:
     return f"{kind}, LB {percent(policy.lower_bound, 'g')}"
 
 
-def settings_of(policy: Policy) -> dict[str, Any]:
+def settings_of(policy: Policy) -> Settings:
     """Return the settings by which the policies of `dengine costs` differ, as keyword arguments of
     `Policy`.
 
@@ -353,7 +353,7 @@ def settings_of(policy: Policy) -> dict[str, Any]:
 
 def candidates(
     contender: Contender, costs: Costs, alphas: Sequence[float], lower_bounds: Sequence[float]
-) -> Iterator[dict[str, Any]]:
+) -> Iterator[Settings]:
     """Yield the settings of each policy that is to be tried, as keyword arguments of `Policy`.
 
     First come all pairs of an alpha and a lower bound LB (the success probability that accepted
@@ -614,7 +614,7 @@ def _check_search(data: Dataset, costs: Costs, repeats: int) -> None:
 
 
 def _within_reach(
-    contender: Contender, changes: Iterable[dict[str, Any]], n_good: float
+    contender: Contender, changes: Iterable[Settings], n_good: float
 ) -> tuple[list[Policy], list[str]]:
     """Return the policies to be tried, without repeats, and notes on why others are not tried.
 

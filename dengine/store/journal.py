@@ -67,6 +67,7 @@ DAMAGES = (
 )  # of reading a damaged header or head
 
 Record = StoredDecision | NewLabel | Event
+Fields = dict[str, Any]  # of a header or head, by name
 
 
 def encode_record(record: Record) -> bytes:
@@ -434,7 +435,7 @@ class Journal:
         OSError if it cannot be read. An empty file is a journal without records.
         """
         head = self.head
-        fields: dict[str, Any] = {"newest": None, "n_drained": head.n_drained}
+        fields: Fields = {"newest": None, "n_drained": head.n_drained}
         damaged = 0
         if self._file.size:
             header = self._file.read(HEADER, 0)
@@ -605,7 +606,7 @@ def read_head(journal: Path) -> Head:
     return Head()
 
 
-def _parse_header(header: bytes) -> dict[str, Any]:
+def _parse_header(header: bytes) -> Fields:
     """Return the fields of a header by name; raise one of the types in DAMAGES if it is damaged.
 
     A header without `n_drained`, of an earlier release, gets 0.
@@ -613,13 +614,13 @@ def _parse_header(header: bytes) -> dict[str, Any]:
     return {"n_drained": 0} | _unpack_fields(header[len(MAGIC) :])
 
 
-def _pack_fields(fields: dict[str, Any]) -> bytes:
+def _pack_fields(fields: Fields) -> bytes:
     """Return fields as JSON that ends with their CRC-32, for `_unpack_fields`."""
     text = json.dumps(fields).encode()
     return b'%s, "crc": %d}' % (text[:-1], zlib.crc32(text))
 
 
-def _unpack_fields(content: bytes) -> dict[str, Any]:
+def _unpack_fields(content: bytes) -> Fields:
     """Return the fields of a header or head, by name; raise one of DAMAGES if it is damaged.
 
     DAMAGES are ValueError, LookupError, TypeError and AttributeError. The field "newest", which

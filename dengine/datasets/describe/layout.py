@@ -38,14 +38,16 @@ def layout_of(p: Proposal, files: Tables) -> str:
     """
     kind = p.description.format
     first = files[0]
-    is_wide = bool(numbered_columns(first))
+    is_wide = numbered_columns(first)
     if kind in OBJECTS and len(p.names) > 1 and len(first.lines) == 1 and not is_wide:
         return "files"
     cells = [column[0] for column in first.columns.values() if len(column)]
     longest = max((len(cell) for cell in cells if isinstance(cell, LISTS)), default=0)
     if not is_wide and 1 < longest < LEAST_RUN <= len(first.lines):
-        text = f"lists of {longest}: make a column of each item"
-        raise DataError(f"Expected numbers or curves in the cells of {first.source}, got {text}.")
+        raise DataError(
+            f"Expected numbers or curves in the cells of {first.source}, got lists of {longest}: "
+            "make a column of each item."
+        )
     if is_wide or longest > 1:
         return "npz" if kind == "npz" else "wide"
     columns = columns_of(files, TextForm())

@@ -33,7 +33,8 @@ MOST_BYTES = 2_000_000  # of a file that are read
 MOST_LINES = 200  # by which the delimiter and the first row of samples are found
 MOST_NAMES = 20  # columns without a header that get a name each
 DIGITS = re.compile(r"\d+")
-FRACTION = re.compile(r"-?\d+,0\d+")  # no two whole numbers: none is written 05
+# Lines with a decimal comma: no whole number is written 05, nor stands between other delimiters.
+FRACTION = re.compile(r"-?\d+,0\d+|(?=.*[;\t|])(.*[;\t|])?\s*-?\d+,\d+\s*([;\t|].*)?")
 WHOLE = re.compile(r"-?\d+(\.0*)?(e\+00)?")
 UNIT_WORDS = re.compile(
     r"(?i)[\[(]?(hh:mm(:ss)?|dd\.mm\.yyyy|[\d.]+ ?[mu]?s|[mun]?s(ecs?)?|min|h)[\])]?"
@@ -110,9 +111,9 @@ def _share_of_numbers(lines: Sequence[str], delimiter: str) -> tuple[float, int,
     with the most frequent number of cells, times the share of numbers among their cells that are
     not empty, plus 0.01; it is divided by 1.15 if the delimiter is a blank, since cells may have
     blanks in them, and rounded to two decimals, so that near scores are equal. If the most frequent
-    number is below 2, all these cells are empty, or a whole line is like `5,04`, with a decimal
-    comma, and the delimiter is a comma, the result is a score of 0 and a single cell. The first
-    third of the lines, which may be text above the samples, and empty lines are left out.
+    number is below 2, all these cells are empty, or a line is like `5,04` or `RUN;5,4`, with a
+    decimal comma, and the delimiter is a comma, the result is a score of 0 and a single cell. The
+    first third of the lines, which may be text above the samples, and empty lines are left out.
     """
     rows = [split_line(line, delimiter) for line in lines[len(lines) // 3 :] if line.strip()]
     width = mode([*map(len, rows), 0])
