@@ -114,7 +114,7 @@ def test_a_trained_encoder_beats_the_base_rate_starts_conv_and_has_its_section_o
 
 CHANGED = """
 README.md                   | 992 |
-docs/explanation/faults.md  | 24,369 |
+docs/explanation/faults.md  | 25,826 |
 docs/explanation/proof.md   | informative | 330 | 341 |
 docs/explanation/speed.md   0.357 s
 docs/results/index.md       | insertion | 1503 | 992 |

@@ -40,7 +40,6 @@ SENTINEL = re.compile(
     r"(?i)[-+]?(9{4,}([.,](0+|9+))?|1([.,]0+)?e\+?3\d|9[.,]9\d*e\+?37|3[.,]40\d*e\+?38)"
     r"|-999[.,](25|0+)"
 )
-VERDICT_FOLDER = re.compile(rf"(?i)(?<![^/])({WORD})/")
 STAMP_NAME = re.compile(r"(?i)stamp|stempel|created|date|datum|epoch")
 SCALE_NAME = re.compile(
     r"(?i)(^|[^a-z]|(?-i:(?<=[a-z])(?=[A-Z])))(unit(?!.*(serial|id|no|nr|under))|uom|einheit|scale"
@@ -373,13 +372,13 @@ def propose_order(p: Proposal) -> None:
     stated stays. Raises SettingError for a malformed `windows.trigger`.
     """
     paths = [without_label(p.description.label, without_suffix(name)) for name in p.names]
-    # A folder of a verdict is no step of the production, even if the label stands elsewhere.
-    paths = sorted((VERDICT_FOLDER.sub("", path) for path in paths), key=natural_key)
     names = [path.rpartition("/")[2] for path in paths]
-    label_is_open = p.description.label.column == UNKNOWN  # and may be a folder
-    if not label_is_open and names != sorted(names, key=natural_key):
+    # A folder of a verdict is no step of the production, even if the label stands elsewhere.
+    paths = [re.sub(rf"(?i)(?<![^/])({WORD})/", "", path) for path in paths]
+    by_folder = [path.rpartition("/")[2] for path in sorted(paths, key=natural_key)]
+    # While it is open where the label stands, any folder may be one of a verdict.
+    if p.description.label.column != UNKNOWN and by_folder != sorted(names, key=natural_key):
         p.put("order", UNKNOWN, "name: by file name, or path: folder by folder")
-    names.sort(key=natural_key)
     matches = [*filter(None, map(DATE.search, names))]
     dates = [match.string[match.start() :] for match in matches]
     if any(match["odd"] for match in matches) or dates != sorted(dates, key=natural_key):
