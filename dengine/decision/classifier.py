@@ -154,7 +154,8 @@ class WilsonRadiusClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[mi
         On a tie, and without neighbours, it is the first of two classes, the failure. If `fit` got
         a single class, it is always this class. Raises NotFittedError before `fit`.
         """
-        return np.asarray(self.classes_[self.predict_proba(Z).argmax(axis=1)])
+        rates = self.predict_proba(Z)
+        return np.asarray(self.classes_[rates.argmax(axis=1)])
 
     def policy(self) -> Policy:
         """Return the policy of these settings; SettingError if one of them is out of range.
