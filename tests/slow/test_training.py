@@ -116,7 +116,7 @@ CHANGED = """
 README.md                   | 992 |
 docs/explanation/faults.md  | 25,826 |
 docs/explanation/proof.md   | informative | 330 | 341 |
-docs/explanation/speed.md   0.357 s
+docs/explanation/speed.md   0.704 s
 docs/results/index.md       | insertion | 1503 | 992 |
 """
 
