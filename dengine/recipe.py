@@ -111,8 +111,8 @@ class Recipe:
         A name in `REDUCERS`, `module:Class` of your own, or a scikit-learn transformer.
     params : mapping, default {}
         Parameters of the reducer, if it is given by name. The names consist of letters, digits,
-        `_` and `-`; the values are booleans, numbers, texts or None. The reducer checks them when
-        it is made.
+        `_` and `-`; the values are booleans, numbers, texts but "none", or None. The reducer checks
+        them when it is made.
     policy : Policy
         Error level, lower bound, interval, decision rule, audit rate.
     radius : float, optional
@@ -175,7 +175,7 @@ class Recipe:
             self.params,
         )
         for name, value in self.params.items():
-            is_plain = value is None or isinstance(value, PLAIN)
+            is_plain = value is None or (isinstance(value, PLAIN) and value != "none")
             expect(
                 is_plain and BARE_KEY.fullmatch(str(name)) is not None,
                 "params of plain names and values",
@@ -396,7 +396,8 @@ def _name_and_params(reducer: Any, params: Params) -> tuple[str, Params]:
     Plain values are booleans, numbers and texts. A name is returned unchanged, with `params`. For
     an estimator the result is the `module:Class` of its class and its `get_params(deep=False)`,
     without those that are None. It is "object Class" and no parameters if a parameter is no plain
-    value, or is None though its default is not, or if the class is local or stands in `__main__`.
+    value or is the text "none", or is None though its default is not, or if the class is local or
+    stands in `__main__`.
     """
     if isinstance(reducer, str):
         return reducer, params
@@ -404,7 +405,8 @@ def _name_and_params(reducer: Any, params: Params) -> tuple[str, Params]:
     values: dict[str, Any] = reducer.get_params(deep=False)
     defaults = {name: parameter.default for name, parameter in signature(cls).parameters.items()}
     is_plain = all(
-        isinstance(value, PLAIN) or (value is None and defaults.get(name) is None)
+        (isinstance(value, PLAIN) and value != "none")
+        or (value is None and defaults.get(name) is None)
         for name, value in values.items()
     )
     if not is_plain or "<locals>" in cls.__qualname__ or cls.__module__ == "__main__":

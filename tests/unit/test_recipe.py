@@ -16,7 +16,10 @@ from dengine.model.neighbours import ModelPrediction
 from dengine.recipe import RECIPES
 
 scalars = st.one_of(
-    st.booleans(), st.integers(-(2**63), 2**63 - 1), st.floats(allow_nan=False), st.text()
+    st.booleans(),
+    st.integers(-(2**63), 2**63 - 1),
+    st.floats(allow_nan=False),
+    st.text().filter(lambda text: text != "none"),
 )
 numpys = st.floats(allow_nan=False, width=32).map(np.float32)
 values = st.one_of(scalars, numpys)
@@ -47,6 +50,11 @@ recipes = st.builds(
 @given(recipes)
 def test_toml_gives_back_the_recipe(recipe):
     assert Recipe.from_toml(recipe.to_toml()) == recipe
+
+
+def test_a_text_that_would_be_read_as_none_is_no_parameter():
+    with pytest.raises(SettingError, match="plain names and values"):
+        Recipe("conv", {"kind": "none"})
 
 
 def test_the_page_of_the_recipes_shows_them_as_they_are(repo):

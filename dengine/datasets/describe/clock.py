@@ -1,5 +1,6 @@
 """Which columns are the clock, in which form, and at which rate the samples follow each other."""
 
+import math
 import re
 from contextlib import suppress
 
@@ -233,8 +234,8 @@ def propose_rate(p: Proposal, tables: Tables) -> None:
     p.put("time.rate_hz", float(f"{1 / usual:.5g}"))
     if p.description.traces.lengths == "resample":
         spans = [seconds[-1] - seconds[0] for _, seconds in clocks]
-        n_steps = np.ceil(np.quantile(spans, SHORT) * p.description.time.rate_hz - EVEN)
-        p.put("traces.samples", int(n_steps) + 1)
+        n_steps = math.ceil(np.quantile(spans, SHORT) * p.description.time.rate_hz - EVEN)
+        p.put("traces.samples", n_steps + 1)
     faults = list[Fault]()
     for table, seconds in clocks:
         with caught(faults, table.source):

@@ -41,8 +41,10 @@ def layout_of(p: Proposal, files: Tables) -> str:
     is_wide = numbered_columns(first)
     if kind in OBJECTS and len(p.names) > 1 and len(first.lines) == 1 and not is_wide:
         return "files"
-    cells = [column[0] for column in first.columns.values() if len(column)]
-    longest = max((len(cell) for cell in cells if isinstance(cell, LISTS)), default=0)
+    longest = max(
+        (len(c[0]) for c in first.columns.values() if len(c) and isinstance(c[0], LISTS)),
+        default=0,
+    )
     if not is_wide and 1 < longest < LEAST_RUN <= len(first.lines):
         raise DataError(
             f"Expected numbers or curves in the cells of {first.source}, got lists of {longest}: "

@@ -356,8 +356,11 @@ def propose_lengths(p: Proposal) -> None:
             p.put("traces.lengths", "strict" if is_few else "pad", text)
         n_filled = sum(np.array_equal(np.nan_to_num(x[-2:]), [0, 0]) for x in column.numbers)
         note = f"{n_filled} recordings end with several zeros or NaN: are these samples?"
-        usual = p.description.traces.samples or usual
-        p.put("traces.samples", usual, note if n_filled > SPARSE * len(lengths) else "")
+        p.put(
+            "traces.samples",
+            p.description.traces.samples or usual,
+            note if n_filled > SPARSE * len(lengths) else "",
+        )
 
 
 def propose_order(p: Proposal) -> None:
