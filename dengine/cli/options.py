@@ -294,7 +294,7 @@ class RecipeChoice:
 
         It is what `make_contender` makes. But if `store` was used, and the name is that of its
         reducer or was not given, it is the store's recipe with the settings that were given: the
-        others need no agreement. A store that is missing or cannot be opened is taken for new.
+        others stay as stored. A store that is missing or cannot be opened is taken for new.
         Raises SettingError like `make_contender`, and if the stored recipe cannot be read.
         """
         from ..recipe import Recipe

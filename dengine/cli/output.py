@@ -202,7 +202,8 @@ def table_of_rows(
     """Return a rich Table whose first column is bold; passwords of database URLs are masked.
 
     A cell that is too wide is folded; the first column only if it has a cell of more than 40
-    characters (`LONGEST_NAME`).
+    characters (`LONGEST_NAME`). Print it with `markup=False`: cells and titles of columns are not
+    escaped.
 
     Parameters
     ----------

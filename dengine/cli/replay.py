@@ -620,10 +620,10 @@ def _cost_cells(row: PolicyCost, is_chosen: bool) -> tuple[str, ...]:
     """Return the cells of a policy's row in the table of costs, under the titles in `COLUMNS`.
 
     They are its rule (like "alpha 0.1" if its guarantee is local, else the name of the guarantee;
-    "> " stands before it if the policy is chosen), LB, its lower bound ("-" if its guarantee is
-    cost), cost with its interval in a second line, late cost (over the last third of
-    each shuffle), share of verified parts, and wrong accepts and rejects with the intervals of
-    their shares.
+    "> " stands before it if the policy is chosen), its LB in percent (`lower_bound` of the
+    policy; "-" if its guarantee is cost), cost with its interval in a second line, late cost (over
+    the last third of each shuffle), share of verified parts, and wrong accepts and rejects
+    with the intervals of their shares.
     """
     policy = row.policy
     rule = f"alpha {policy.alpha:g}" if policy.guarantee == "local" else policy.guarantee

@@ -477,7 +477,7 @@ class Description:
 
 
 # The sections, in the order of the file, and what their tables are made of; None: texts.
-SECTIONS: Values = {
+SECTIONS: dict[str, Any] = {
     "text": TextForm,
     "rows": RowWords,
     "time": Clock,

@@ -303,12 +303,13 @@ def _as_stored(
     seconds since 1970.
     """
     fault, content = checked
-    made = replace(
+    with_fault = replace(
         decision,
         reason=REASONS[fault] if fault else decision.reason,
         propensity=1.0 if decision.predicted is Action.VERIFY else policy.audited_share,
     )
-    return StoredDecision(made, trace.copy(), trace_hash(content, made.part), bool(fault), time)
+    hash_ = trace_hash(content, decision.part)
+    return StoredDecision(with_fault, trace.copy(), hash_, bool(fault), time)
 
 
 def _verifying_decisions(traces: TraceArray, data: Dataset) -> Iterator[Decision]:

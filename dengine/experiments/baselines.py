@@ -339,8 +339,8 @@ def baseline_class(name: str) -> type[Baseline]:
     """
     kind = import_class(name) if ":" in name else BASELINES.get(name, object)
     if not issubclass(kind, Baseline):
-        known = ", ".join(BASELINES)
+        names = ", ".join(BASELINES)
         raise SettingError(
-            f"Expected a baseline among {known}, or module:Class of one, got {name}."
+            f"Expected a baseline among {names}, or module:Class of one, got {name}."
         )
     return kind

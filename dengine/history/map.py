@@ -114,22 +114,22 @@ def part_map(store: "SqlStore", recipe: Recipe, version: int) -> PartMap:
             newest[decision.id] = Mark(
                 decision.id, decision.part, *place, item.success, decision.action
             )
-    known: list[Mark] = []
+    references: list[Mark] = []
     if version and (past := load_past_version(store, version, recipe, None)) is not None:
         parts = {item.decision.id: item.decision.part for item in recent}
         points = past.index.column("points")
         labels = past.index.column("labels")
-        references = sorted(
+        slots = sorted(
             (label.seq, slot, label.decision_id) for slot, label in enumerate(past.labels) if label
         )
-        known = [
+        references = [
             Mark(id_, parts.get(id_), *_first_two(points[slot]), bool(labels[slot]), None)
-            for _, slot, id_ in references[-N_KNOWN:]
+            for _, slot, id_ in slots[-N_KNOWN:]
             if id_ not in newest
         ]
     return PartMap(
         version=version,
-        marks=(*known, *newest.values()),
+        marks=(*references, *newest.values()),
         radius=recipe.radius if newest else None,
         probability=has_own_unit(recipe.reducer),
     )

@@ -338,7 +338,7 @@ def test_a_peers_version_that_is_of_no_use_is_left_out_and_the_next_one_answers(
         for _ in range(3):
             second.poll()
     assert (second.version, caplog.text.count("cannot be used")) == (version, 1)
-    share(second, first)
+    share(first, second)
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@
 writes inputs through it.
 """
 
+import math
 import socket
 import struct
 import threading
@@ -14,7 +15,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from itertools import chain
 
-from ...errors import CellError, SettingError, instead
+from ...errors import CellError, SettingError, expect, instead
 from .protocol import (
     CHANNELS,
     PORT,
@@ -344,7 +345,7 @@ class RtdeStream:
             try:
                 for values in client.rows():
                     self._count_and_buffer(Row(values, self._session))
-            except (CellError, ValueError, OverflowError) as error:  # also a time that is no number
+            except CellError as error:
                 client.close()
                 with self._news:
                     self._client = None
@@ -363,11 +364,18 @@ class RtdeStream:
         """Count a package and the packages missing before it, buffer it, and wake who waits in
         `rows`.
 
-        `row` is the package. Times are compared in whole steps of 1 / rate, rounded. A package with
-        the same time as the package before also counts as repeated, and a package with an earlier
-        time counts as a restart of the controller; both are buffered, too. If the buffer is full,
-        its oldest package is dropped, which is not counted.
+        `row` is the package. Raises CellError, and changes nothing, if its time is not finite.
+        Times are compared in whole steps of 1 / rate, rounded. A package with the same time as the
+        package before also counts as repeated, and a package with an earlier time counts as a
+        restart of the controller; both are buffered, too. If the buffer is full, its oldest package
+        is dropped, which is not counted.
         """
+        expect(
+            math.isfinite(row.timestamp / self.step),
+            "a time of the controller that is finite",
+            row.timestamp,
+            error=CellError,
+        )
         with self._news:
             if self._newest is not None:
                 steps = round((row.timestamp - self._newest.timestamp) / self.step)

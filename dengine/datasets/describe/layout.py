@@ -6,7 +6,7 @@ from dataclasses import replace
 
 from ...errors import DataError, listed
 from ..description import ANY, UNKNOWN, Channel, TextForm
-from ..read.split import LISTS, OBJECTS, split
+from ..read.split import OBJECTS, longest_list, split
 from ..table import Table
 from .clock import NAME as CLOCK_NAME
 from .columns import LEAST_RUN, Column, Proposal, Tables, columns_of
@@ -25,6 +25,7 @@ def layout_of(p: Proposal, files: Tables) -> str:
     """Return how the files hold parts, as `Description.layout` names it; `?` if it is not certain.
 
     `files` has the table of each file that is looked at. These rules come one after another.
+    A part is a workpiece.
     Several JSON or .ts files, of which the first has one row, are `files`, unless this row has 20
     or more columns like `x0`, `x1`. Such columns, or lists of two items or more in the first row of
     the first table, make it `wide`, or `npz` for an .npz file. It is `long` if a column of the
@@ -41,10 +42,7 @@ def layout_of(p: Proposal, files: Tables) -> str:
     is_wide = numbered_columns(first)
     if kind in OBJECTS and len(p.names) > 1 and len(first.lines) == 1 and not is_wide:
         return "files"
-    longest = max(
-        (len(c[0]) for c in first.columns.values() if len(c) and isinstance(c[0], LISTS)),
-        default=0,
-    )
+    longest = longest_list(first)
     if not is_wide and 1 < longest < LEAST_RUN <= len(first.lines):
         raise DataError(
             f"Expected numbers or curves in the cells of {first.source}, got lists of {longest}: "

@@ -41,15 +41,13 @@ SENTINEL = re.compile(
     r"|-999[.,](25|0+)"
 )
 STAMP_NAME = re.compile(r"(?i)stamp|stempel|created|date|datum|epoch")
+WORD_BEGINS = r"(?i)(^|[^a-z]|(?-i:(?<=[a-z])(?=[A-Z])))"  # also in `forceUnit`
 SCALE_NAME = re.compile(
-    r"(?i)(^|[^a-z]|(?-i:(?<=[a-z])(?=[A-Z])))(unit(?!.*(serial|id|no|nr|under))|uom|einheit|scale"
-    r"|scaling|factor|faktor|gain|sensitivity|fs|dt|frequency|interval"
+    WORD_BEGINS + r"(unit(?!.*(serial|id|no|nr|under))|uom|einheit|scale|scaling"
+    r"|factor|faktor|gain|sensitivity|fs|dt|frequency|interval"
     r"|(sampl\w*|abtast|scan|data)[ _]?(rate|freq\w*))s?($|[^a-z])"
 )
-SET_VALUE = re.compile(
-    r"(?i)(^|[^a-z]|(?-i:(?<=[a-z])(?=[A-Z])))"
-    r"(set|soll|vorgabe|nominal|target|consigne|max|min|limit)"
-)
+SET_VALUE = re.compile(WORD_BEGINS + r"(set|soll|vorgabe|nominal|target|consigne|max|min|limit)")
 
 # Dates in names. Those in the group `odd` are not sorted by name: they have the day or the month
 # first, the month as a word, or AM and PM.
@@ -336,11 +334,12 @@ def propose_lengths(p: Proposal) -> None:
     """Set `traces.samples` in `p`, if it is 0, to the median length of the recordings.
 
     It is rounded down. The length is that of the first channel; without one nothing is set.
-    Recordings without rows are ignored; if all are, the length is 0. If some have another length,
-    and `traces.lengths` is not stated, a note counts them, and `traces.lengths` becomes `pad` if
-    they are more than 10 % of the recordings, else `strict`. A stated `traces.samples` stays.
-    Unless it is stated, another note counts the recordings that end with two zeros or NaN or more,
-    if they are more than 10 %: these may fill up shorter recordings.
+    Recordings without rows are ignored; if all are, the length is 0. If some have another length
+    than this median, also where `traces.samples` is stated, and `traces.lengths` is not stated, a
+    note counts them, and `traces.lengths` becomes `pad` if they are more than 10 % of the
+    recordings, else `strict`. A stated `traces.samples` stays. Unless `traces.samples` is stated,
+    another note counts the recordings that end with two zeros or NaN or more, if they are more
+    than 10 %: these may fill up shorter recordings.
     """
     if p.description.channels:
         column = p.columns[next(iter(p.description.channels))]
@@ -367,12 +366,13 @@ def propose_order(p: Proposal) -> None:
     """Set `order` in `p` to `?`, with a note, if the file names, sorted, need not be the order.
 
     That is so if the files of the folders, one folder after the other, have another order, with the
-    text of `label.path` left out; if a file name has a date with the day or the month first, the
+    text of `label.path` and folders named like a verdict left out (not looked at while
+    `label.column` is `?`); if a file name has a date with the day or the month first, the
     month as a word, or AM or PM, by which names do not sort; if the names are not in the order of
-    their dates; or if a column of `p.unused` has one word per recording, which is a date or time or
-    whose name says so (`timestamp`, `created`), and these, as `natural_key` sorts texts, are in
-    another order. If several of these hold, the note is on the last. An `order` that the user
-    stated stays. Raises SettingError for a malformed `windows.trigger`.
+    their dates; or if a column of `p.unused` has one word (text of a cell) per recording, which is
+    a date or time or whose name says so (`timestamp`, `created`), and these, as `natural_key`
+    sorts texts, are in another order. If several of these hold, the note is on the last. An `order`
+    that the user stated stays. Raises SettingError for a malformed `windows.trigger`.
     """
     paths = [without_label(p.description.label, without_suffix(name)) for name in p.names]
     names = [path.rpartition("/")[2] for path in paths]

@@ -113,7 +113,8 @@ def _share_of_numbers(lines: Sequence[str], delimiter: str) -> tuple[float, int,
     blanks in them, and rounded to two decimals, so that near scores are equal. If the most frequent
     number is below 2, all these cells are empty, or a line is like `5,04` or `RUN;5,4`, with a
     decimal comma, and the delimiter is a comma, the result is a score of 0 and a single cell. The
-    first third of the lines, which may be text above the samples, and empty lines are left out.
+    first third of the lines, which may be text above the samples, and empty lines are left out, but
+    a decimal comma counts in any line; alone in a line, only with a 0 behind it.
     """
     rows = [split_line(line, delimiter) for line in lines[len(lines) // 3 :] if line.strip()]
     width = mode([*map(len, rows), 0])

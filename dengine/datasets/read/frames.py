@@ -133,8 +133,9 @@ def as_cells(values: Any) -> Cells:
 def read_frame(frame: Any, source: str) -> Table:
     """Return the table of a DataFrame, whose index is a column, or several.
 
-    An index without a name, of one level and not of times, is left out. `source` is the table's
-    name in errors. Names of columns become texts; rows are numbered from 1. Raises ValueError if
+    An index without a name, of one level and not of times, is left out; one of times becomes the
+    column `index`. `source` is the table's name in errors. Names of columns become texts, which
+    must differ: this is not checked. Rows are numbered from 1. Raises ValueError if
     the index is named like a column.
     """
     is_plain = frame.index.names == [None] and frame.index.dtype.kind not in "mM"

@@ -150,15 +150,15 @@ def label_of(labels: Sequence[LabelReader], table: Table, part: str) -> int | No
     that it was not checked. Raises DataError if the path of a source is no regular expression with
     one group.
     """
-    found = [reader.label(table, part) for reader in labels]
-    for i, label in enumerate(found):
-        if label != found[0]:
+    by_source = [reader.label(table, part) for reader in labels]
+    for i, label in enumerate(by_source):
+        if label != by_source[0]:
             raise UnreadableError(
-                f"Expected labels that agree, [label] says {WORDS[found[0]]}, [[check]] {i} says "
-                f"{WORDS[label]}",
+                f"Expected labels that agree, [label] says {WORDS[by_source[0]]}, [[check]] {i} "
+                f"says {WORDS[label]}",
                 column=labels[i].source.column,
             )
-    return found[0]
+    return by_source[0]
 
 
 def read_recordings(
@@ -341,19 +341,16 @@ def fitted(samples: Floats, seconds: Floats | None, description: Description) ->
     n = samples.shape[1]
     kind = FITS.index(about.lengths.removesuffix("-all"))
     can_fit = can_fit_length(n, about.samples, kind) or (about.lengths == "pad-all" and n > 0)
-    wanted, actual = f"{about.samples} samples", f"{n}"
+    wrong = f"Expected {about.samples} samples, got {n}"
     if about.lengths == "resample" and seconds is not None:
         seconds = seconds - seconds[0]
         times = np.linspace(0, seconds[-1], about.samples)
         if rate:
             times = np.arange(about.samples) / rate
             can_fit = bool(times[-1] <= seconds[-1] + (1 + ROUNDING) / rate)
+            wrong += f", which last {seconds[-1]:.4g} s and not {times[-1]:.4g} s"
         if can_fit:
             return np.stack([np.interp(times, seconds, row) for row in samples]).astype(np.float32)
-        wanted += f" in {times[-1]:.4g} s"
-        actual += f" in {seconds[-1]:.4g} s"
     elif can_fit:
         return fit_length(torch.from_numpy(samples.astype(np.float32)), about.samples, kind).numpy()
-    raise UnreadableError(
-        f"Expected {wanted}, got {actual}; see traces.lengths, which is {about.lengths}"
-    )
+    raise UnreadableError(f"{wrong}; see traces.lengths, which is {about.lengths}")

@@ -17,7 +17,6 @@ from .text import read_text
 
 NUMBERED = r"(\d+(?:\.\d+)?(?:e-?\d+)?)"  # for which `*` stands in a wide table: `F*` is not `Fmax`
 OBJECTS = ("json", "jsonl", "ts")
-LISTS = (list, np.ndarray)
 
 
 def table_of(content: bytes, name: str, description: Description) -> Table:
@@ -103,17 +102,20 @@ def split(table: Table, description: Description) -> Iterator[Table]:
     elif layout == "columns":
         yield from _split_columns(table, description)
     elif layout in ("wide", "npz") or (
-        description.format in OBJECTS and (len(table.lines) == 1 or has_lists(table))
+        description.format in OBJECTS and (len(table.lines) == 1 or longest_list(table) > 1)
     ):
         yield from _split_wide(table, description)
     else:
         yield table
 
 
-def has_lists(table: Table) -> bool:
-    """Return whether the first cell of any column is a list or array of two items or more."""
+def longest_list(table: Table) -> int:
+    """Return the most items of a list or array among the first cells of the columns.
+
+    0 if none of these cells is a list.
+    """
     cells = [column[0] for column in table.columns.values() if len(column)]
-    return any(isinstance(cell, LISTS) and len(cell) > 1 for cell in cells)
+    return max((len(cell) for cell in cells if isinstance(cell, frames.ITEMS)), default=0)
 
 
 def _split_rows(table: Table, description: Description) -> Iterator[Table]:
