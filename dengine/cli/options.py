@@ -691,7 +691,7 @@ def data_options(
 
 
 def recorder_settings(options: Options) -> tuple[Values, TraceSpec]:
-    """Return the settings of an `RtdeValueser`, by its argument names, and its `TraceSpec`.
+    """Return the settings of an `RtdeRecorder`, by its argument names, and its `TraceSpec`.
 
     They come from the values of `--samples`, `--channels`, `--rate-hz`, `--unit` and `--fit` in
     `options`, by the names in `TRACE`, as far as they were given; other options are ignored. The

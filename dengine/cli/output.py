@@ -350,6 +350,7 @@ FORMATTERS: dict[str, Callable[[float], str]] = {
     **dict.fromkeys(("share", "rate", "tolerance"), percent),
     "_bytes": format_size,
     "_hz": lambda hertz: f"{hertz:g} Hz",
+    "distance": lambda value: f"{value:.3g}",
 }
 
 

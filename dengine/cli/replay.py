@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
+from textwrap import wrap
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -222,7 +223,7 @@ def replay(choice: RecipeChoice, **played: Any) -> None:
     _replay_and_print([choice.make_contender()], {}, **played)
 
 
-@verb("dengine compare --data insertion --reducers conv,pca --repeats 2 --out out/")
+@verb("dengine compare --data insertion --reducers conv,pca --repeats 2 --out compared/")
 @options.data_options()
 @click.option(
     "--reducers",
@@ -558,8 +559,12 @@ def costs(
         settings = settings_of(curve.policy)
         record["python"] = f"Policy({', '.join(f'{k}={v!r}' for k, v in settings.items())})"
         store = source.data if source.data.endswith(".db") else "cell.db"
-        record["command"] = f"dengine policy {store} {_as_flags(settings)}"
-        lines.append(f"Set it by\n  {record['command']}\n  {record['python']}")
+        # What is not given stays as it is in the store.
+        names = "guarantee", "alpha", "audit_rate", "stops"
+        kept = {name: getattr(curve.policy, name) for name in names}
+        record["command"] = f"dengine policy {store} {_as_flags(settings | kept)}"
+        command = " \\\n    ".join(wrap(record["command"], 72, break_on_hyphens=False))
+        lines.append(f"Set it by\n  {command}\n  {record['python']}")
     frame = curve.to_frame()
     print_result(
         record | {"rows": frame.to_dict("records")},

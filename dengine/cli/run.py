@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 STRETCHES = 6  # rows of the table
 
 
-@verb("dengine run --cell replay --cycles 100 --store engine.db --alpha 0.1 --lower-bound 0.9")
+@verb("dengine run --cell replay --cycles 100 --store run.db --alpha 0.1 --lower-bound 0.9")
 @click.option(
     "--cell",
     "kind",

@@ -455,9 +455,11 @@ def import_labels(journal: Path, store: str, any_model: bool) -> None:
     """Import the labels of an exported model's program.
 
     JOURNAL is the CSV file that the program wrote. Each line counts once, however often it is
-    imported; a label that contradicts the store's is counted, but not stored. Under the policy
-    --stops all, an accepted part without a report is imported as good, unless it is the last part;
-    under some it is imported without a label. Other parts without a label are left out.
+    imported; a label that contradicts the store's is counted, but not stored. If the policy in the
+    store has --stops all (every bad accepted part stops the system), an accepted part without a
+    report is imported as good, unless it is the last part; with --stops some it is imported without
+    a label. Other parts without a label are left out. A part whose trace has a fault is stored, but
+    never used in training.
     If a line was changed or is missing, the lines before it are imported, the others are not, and
     the exit code is 1. A file that is no journal, has no accepted or labelled part, has a line that
     cannot be read, or belongs to another model (unless --any-model, or the store records no export)

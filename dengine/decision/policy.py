@@ -217,8 +217,10 @@ class Policy:
 
         `values` holds the settings by name. The force limits are one text, separated by spaces, or
         "none"; in older stores their name is "windows". Names that are no settings are ignored. A
-        missing audit rate, guarantee or `prices` follow from the other settings, as in the class.
-        Raises SettingError for a value out of its range.
+        missing guarantee (the rule that decides) is "local", and a missing audit rate (share of
+        certain decisions that are verified all the same) 0; with `prices` and no guarantee they are
+        "cost" and 0.05. Raises SettingError for a value out of its range, and for a guarantee that
+        needs audits without them.
         """
         settings = {f.name: values[f.name] for f in fields(cls) if f.name in values}
         limits = values.get("force_limits", values.get(OLD_NAME, NO_LIMITS))

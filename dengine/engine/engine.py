@@ -814,7 +814,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         also one in the executor, the call waits until the store has all labels; if it does not take
         them in time, or has a fault, the retrain waits for a later call. In a product, newer
         versions and corrections of the other cells are put in force, which are looked for once a
-        second. If a safe mode began or ended, an event is recorded, and `on_safe_mode` is called.
+        second, and also when a retrain is due or its training is done. If a safe mode began or
+        ended, an event is recorded, and `on_safe_mode` is called.
 
         Parameters
         ----------

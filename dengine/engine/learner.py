@@ -118,8 +118,11 @@ class Learner:
             self.precompute()
 
     def _refill_window(self, corrected_to: int) -> None:
-        """Read the training window from the store, with corrections up to this number, and count
-        the new labels again.
+        """Read the training window from the store, and count the new labels again.
+
+        Corrections up to the number `corrected_to` are applied. A label is new if its number is
+        above `counts_from` of the version in force (`TrainedOn`). A damaged trace is left out, and
+        reported by an event in the store. Raises StoreError if the store cannot be read.
         """
         self._window.refill(
             self._store.labels.with_traces(self._window.capacity, corrected_to=corrected_to)
@@ -246,9 +249,10 @@ class Learner:
         and is to begin again. A pinned version is not replaced, and such a request is withdrawn.
         What the copying of a model that the user handed in raises is raised.
 
-        In a product a newer version and corrections of other cells are put in force first, so a
-        peer's version may be in force afterwards, even if nothing is trained here. They are looked
-        for once a second, and if a retrain is due.
+        In a product a newer version and corrections of labels of other cells are put in force
+        first, so a peer's version may be in force afterwards, even if nothing is trained here. They
+        are looked for once a second, and in each call while `retrain_every` labels are new and no
+        version is pinned, even if there are too few labels for a training.
 
         Parameters
         ----------

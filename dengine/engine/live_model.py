@@ -348,7 +348,7 @@ class LiveModel:
         mode that `evidence` names. The second copy is None before the first retrain; it shares the
         references of the model in force. A baseline, which has no such rule, is returned itself. If
         the second cannot be made ready to predict, that is logged. Neither is put in force. Raises
-        SettingError if the rule cannot be made.
+        what `Policy.rule` raises, such as SettingError if the rule cannot be made.
         """
         template = self.template.with_policy(policy)
         template.reset_rule(evidence.began_in)

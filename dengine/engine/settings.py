@@ -274,14 +274,15 @@ def _with_objects(
 ) -> Recipe:
     """Return a stored recipe, with the reducer object put into it if the recipe cannot name it.
 
-    `texts` are the store's settings, and `name` is the name of the store for messages. If the
-    recipe names its reducer, `reducer` is not used. It may then be a name, which is not compared
-    here, or an object that `to_toml` writes with the recipe's name and parameters; so no object
-    matches a short name like "conv". With a model any reducer is accepted. Raises SettingError if
-    an object is missing or differs from the one that the store was made with (a reducer in its
-    description, a model in its class alone), if a `model` is passed to an engine that trains the
-    recipe's own model, or if it is no baseline (`BaselineAdapter`). A store that holds no
-    description of its object accepts any.
+    `texts` are the store's settings, and `name` is the name of the store for messages. A recipe
+    that names its reducer is returned as it is. With such a recipe `reducer` may be None, a name,
+    which is not compared here, or an object that `to_toml` writes with the recipe's name and
+    parameters, so none if the recipe has a short name like "conv"; SettingError is raised for any
+    other object. With a model any reducer is accepted. Raises SettingError, too, if an object that
+    the recipe cannot name is missing or differs from the one that the store was made with (a
+    reducer in its description, a model in its class alone), if a `model` is passed to an engine
+    that trains the recipe's own model, or if `BaselineAdapter` refuses the model. A store that
+    holds no description of its object accepts any.
     """
     if "model" in texts and model is None:
         raise SettingError(

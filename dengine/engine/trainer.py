@@ -185,9 +185,11 @@ class TrainedOn:
 
     @classmethod
     def from_state(cls, state: Mapping[str, NDArray[Any]]) -> Self:
-        """Return the record that `to_state` turned into arrays; without "pinned" it is not pinned.
+        """Return the record that `to_state` turned into arrays.
 
-        Arrays of other names are ignored. Raises KeyError if another of the four is missing.
+        Without "pinned" the version counts as not pinned (put in force again by a rollback). Arrays
+        of other names are ignored. Raises KeyError without "trained_on", "trained_as" or
+        "counts_from".
         """
         return cls(
             state["trained_on"],

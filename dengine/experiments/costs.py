@@ -338,16 +338,17 @@ def settings_of(policy: Policy) -> Settings:
     """Return the settings by which the policies of `dengine costs` differ, as keyword arguments of
     `Policy`.
 
-    They are alpha, lower_bound and guarantee, or only the prices under the guarantee "cost", since
-    the prices imply the other three. stops is added if it is "all", and audit_rate if it is not 0,
-    or, under "cost", not 0.05. The interval, the force limits and all other settings are left out.
+    They are alpha, lower_bound and guarantee, or only the prices under the guarantee "cost", which
+    they imply. stops is added if it is "all", and alpha under "cost" and audit_rate if they are not
+    those of a new policy. The interval, the force limits and all other settings are left out;
+    lower_bound has no effect under "cost".
     """
-    names = ["alpha", "lower_bound", "guarantee"]
-    if policy.guarantee == "cost":
-        names = ["prices"]
+    names = ["prices"] if policy.guarantee == "cost" else ["alpha", "lower_bound", "guarantee"]
     settings = {name: getattr(policy, name) for name in names}
-    if policy.audit_rate != Policy(**settings, stops="all").audit_rate:
-        settings["audit_rate"] = policy.audit_rate
+    plain = Policy(**settings, stops="all")
+    for name in ("alpha", "audit_rate"):
+        if getattr(policy, name) != getattr(plain, name):
+            settings[name] = getattr(policy, name)
     return settings | ({"stops": "all"} if policy.stops == "all" else {})
 
 
@@ -677,8 +678,8 @@ def _screen(
     dengine is replayed once for each seed, in shadow mode and with the force limits of the
     contender's recipe. The rule of each policy decides on its predictions (`replay_policy`); force
     limits of `policies` are not applied. A baseline has no such predictions: each policy has a
-    replay of its own. Policies vary fastest. `play` plays tasks and returns their replays; if it
-    returns fewer, fewer are yielded.
+    replay of its own. Policies vary fastest. A replay shuffles and plays `cycles` parts. `play`
+    plays tasks and returns their replays; if it returns fewer, fewer are yielded.
     """
     if contender.baseline is not None:
         yield from play(_tasks(contender, policies, seeds, cycles))

@@ -270,6 +270,7 @@ def iterate_replays(
 ) -> Iterator[PlayedReplay]:
     """Play tasks, each a replay to be played, and yield each replay as soon as it is finished.
 
+    A replay plays the parts of a data set, one in each cycle, through a fresh engine (`replay`).
     Replays that an earlier run kept in the folder `keep` come first. The other tasks are begun seed
     by seed, so that the replays that an interrupted run has finished can be compared; they are
     yielded in the order in which they end. Nothing is read, played or raised before the first

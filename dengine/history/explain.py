@@ -185,7 +185,8 @@ def explain(store: SqlStore, decision_id: str, neighbours: int = 10) -> Explanat
     SettingError
         For a stored recipe or policy that cannot be read, if an object of the user's class of rule
         cannot be made, and for a part outside the force limits if one of them does not fit its
-        trace. An error of the rule's constructor other than TypeError is raised as it is.
+        trace. An error of the rule's constructor other than TypeError, and what its `observe` and
+        `update` raise, is raised as it is.
     """
     settings = store.settings.read()
     if "recipe" not in settings:

@@ -101,7 +101,8 @@ def part_map(store: "SqlStore", recipe: Recipe, version: int) -> PartMap:
     ------
     SettingError
         For an unknown reducer, and if an object of the user's class of rule cannot be made. An
-        error of the rule's constructor other than TypeError is raised as it is.
+        error of the rule's constructor other than TypeError, and what its `observe` and `update`
+        raise, is raised as it is.
     StoreError
         If the store cannot be read.
     """

@@ -759,7 +759,7 @@ class ModelPrediction(EngineModel):
         ------
         RuntimeError
             If the decision rule is stale, because an update of it failed, and the trace has no
-            fault, even if a force limit decides. A faulty trace is verified without the rule.
+            fault, even if a force limit decides. A faulty trace gets VERIFY without the rule.
         ValueError, ...
             What `build_decider`, the reducer's encoder or the rule raises.
         """

@@ -51,7 +51,7 @@ from ..store.records import Correction, Event, StoredDecision, StoredVersion
 from ..traces import LARGEST
 from .service import ReportResponse, ServiceResponse
 
-T = TypeVar("T")
+T = TypeVar("T", bound=msgspec.Struct)
 Json = dict[str, Any]
 JSON = "application/json"
 RAW = "application/octet-stream"
@@ -134,7 +134,8 @@ async def read_body(request: Request, struct_type: type[T]) -> T:
         # msgspec takes a text for bytes in base64; whoever sends one knows nothing of that.
         wanted = "Expected lists of numbers, or raw float32 in base64, got a text"
         text = str(error).replace("Invalid base64 encoded string", wanted)
-        raise HTTPException(422, f"{text}.") from error
+        names = ", ".join(struct_type.__struct_encode_fields__)
+        raise HTTPException(422, f"{text}. The names are {names}.") from error
     except (ValueError, RecursionError) as error:
         raise HTTPException(400, f"Expected {JSON}: {error}.") from error
     # msgspec takes the last of two equal keys.

@@ -245,9 +245,9 @@ class RobotCalls:
         Returns
         -------
         struct
-            A dict: action (0 verify, 1 accept, 2 reject), id, reason, lower, upper and version. If
-            the queue is full, or the service or its engine is closed, verify with an id "" and the
-            reason "busy".
+            A dict: action (0 verify, 1 accept, 2 reject), id, reason, lower and upper (bounds of
+            the success probability) and version. If the queue is full, or the service or its engine
+            is closed, verify with an id "" and the reason "busy".
 
         Raises
         ------
@@ -414,7 +414,8 @@ def one_line(text: str) -> str:
 
 def _as_struct(decision: Decision) -> Struct:
     """Return a decision as a dict of plain types: action (0 verify, 1 accept, 2 reject), id,
-    reason (a text), lower, upper, and version, the number of the model version that decided.
+    reason (a text), lower and upper, the bounds of the success probability, and version, the number
+    of the model version that decided.
     """
     return {
         "action": ACTIONS.index(decision.action),

@@ -460,7 +460,7 @@ class Database:
     def check_integrity(self, window: int, since: int | None = None) -> str:
         """Compare the rows that an engine reads with the ledgers (hash chains) of their cells.
 
-        These are the settings, corrections, labels and model versions of this cell, and of the
+        These are settings, labels, corrections of labels and model versions of this cell and the
         other cells of its product. Of the labels only the newest are checked. The rest is checked
         in full, except for the arrays of the versions and the settings that the store itself keeps
         (`RESERVED`); of each ledger itself only the newest entry. A ledger with another key than
@@ -470,8 +470,9 @@ class Database:
         Parameters
         ----------
         window : int
-            Number of newest labels that are checked, at least, without those of quarantined traces.
-            In a product fewer are checked if most of the newest labels are of such traces.
+            How many of the newest labels are checked, at least. Labels of quarantined traces among
+            them are checked, too, but not counted. In a product the newest 2 * `window` labels of
+            all its cells together are checked instead, and every label counts.
         since : int or None
             If given, the labels after this number are checked instead of the newest `window`.
 

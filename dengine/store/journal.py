@@ -329,8 +329,9 @@ class Journal:
     def _write_head(self) -> None:
         """Write the attribute `head` to the small file beside the journal, without a sync.
 
-        The file is created if need be. A failure is ignored: an older head is harmless. The caller
-        holds the lock `_describing`.
+        It names the newest ledger entry, the last record that the store holds and the newest synced
+        one (`Head`). The file is created if need be. A failure is ignored: an older head is
+        harmless. The caller holds the lock `_describing`.
         """
         with suppress(OSError):
             descriptor = open_plain(head_path(self.path), os.O_WRONLY | os.O_CREAT)

@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dengine import Policy, Recipe
+from dengine import DataEngine, Policy, Recipe
 from dengine.errors import SettingError
 from dengine.experiments.costs import (
     CostCurve,
@@ -303,9 +303,12 @@ def test_the_verb_shows_a_table_and_writes_the_curve(recordings):
     assert len(result["rows"]) == len(lines) - 1
     assert result["sentence"] in shown
     assert "check all" in shown
-    if result["policy"]:
-        assert result["python"] in shown
-        assert result["command"].startswith("dengine policy cell.db --")
+    assert result["python"] in shown
+    stricter = Policy(0.05, 0.95, audit_rate=0.2, stops="all")
+    DataEngine("pca", store="cell.db", policy=stricter).close()
+    succeed(*shlex.split(result["command"])[1:])  # it also sets what a new policy would have
+    with DataEngine.open("cell.db", reading=True) as engine:
+        assert engine.policy == eval(result["python"], {"Policy": Policy})
     again = document(*WORDS, "--escape", "21")  # other prices, the same replays
     assert again["costs"]["escape"] == 21
 

@@ -113,9 +113,10 @@ def is_counter(column: Column) -> bool:
 
     A mere numbering of the rows does not. The steps from row to row (`Column.steps`) decide. For a
     column that is named like a counter (`index`, `sample`, `n`, ...) the result is True if any step
-    differs by more than 1 % from the median step. For any other column it is True if no step does
-    and the median is neither 0 nor 1; but it is False if the column is named like a force, has a
-    unit of a quantity that is not time, or is named like `x*`, the samples of a wide table.
+    differs by more than 1 % from the median step, or if this is negative. For any other column it
+    is True if no step does and the median is neither 0 nor 1; but it is False if the column is
+    named like a force, has a unit of a quantity that is not time, or is named like `x*`, the
+    samples of a wide table.
     """
     steps = column.steps
     usual = float(np.median(steps)) if len(steps) else 0.0

@@ -171,7 +171,8 @@ class Column:
 def columns_of(tables: Tables, form: TextForm) -> dict[str, Column]:
     """Return the columns of the first table by their names, each with the tables that have it.
 
-    Columns that only other tables have are left out. `form` is the section `[text]`.
+    Columns that only other tables have are left out. `form` is the section `[text]` of the
+    description: how numbers are written.
     """
     return {
         name: Column(name, [table for table in tables if name in table.columns], form)

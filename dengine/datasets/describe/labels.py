@@ -169,12 +169,13 @@ def sources_of(p: Proposal, paths: Names) -> Iterator[LabelSource]:
     """Yield the sources that may hold the labels.
 
     They come in this order: pairs of columns of listings (files among `p.others` with a row for
-    each recording or part), of which one may name these (`key`), since it has more different words
-    than half of its rows, and the other may hold labels (`may_be_labels`); regular expressions for
-    the paths, of words like "ok" in them and of any words at fixed places; columns without another
-    use that have one word in all rows of a recording; and lines above the header of the first
-    table. A file that cannot be read as a listing is skipped. Raises SettingError for a malformed
-    `windows.trigger`, and UnreadableError if cells of a column without another use are lists.
+    each recording or workpiece), of which one may name these (`key`), since it has more different
+    words than half of its rows, and the other may hold labels, since it has few different words
+    (`may_be_labels`); regular expressions for the paths, of words like "ok" in them and of any
+    words at fixed places; columns without another use that have one word in all rows of a
+    recording; and lines above the header of the first table. A file that cannot be read as a
+    listing is skipped. Raises SettingError for a malformed `windows.trigger`, and UnreadableError
+    if cells of a column without another use are lists.
 
     paths : the path of each recording.
     """

@@ -68,8 +68,8 @@ def propose_roles(p: Proposal) -> None:
 
     The columns are those of `p.tables`. In this order: columns that tell which rows are samples,
     clock, part, label, channels, and what follows from these: words for lost samples, rate, length
-    of the traces, order, ignored columns and files. If no rule proves a value, the key is `?`, or
-    stays empty like `[part]` and `[channels]`. If it is open which rows are samples,
+    of the traces, order of the parts, ignored columns and files. If no rule proves a value, the key
+    is `?`, or stays empty like `[part]` and `[channels]`. If it is open which rows are samples,
     `traces.samples` is `?` and no rate is set; a clock with `?` gives no rate either, and if its
     column is `?`, `order` stays as it is. `ignored` becomes the columns without any use, with their
     units. `exclude` becomes the files in `p.others` without listings of labels, if there are any,

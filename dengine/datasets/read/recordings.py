@@ -143,12 +143,13 @@ def label_of(labels: Sequence[LabelReader], table: Table, part: str) -> int | No
     """Return the label of a part, 1 good or 0 bad; None if it was not checked.
 
     `labels` has a reader for the source of labels, and for each source that must agree with it;
-    `table` and `part` are the table and the number of the part. A reader of a listing adds the key
-    that it found to its `used`. Raises UnreadableError if a source has no label for the part, a
-    word without a stated meaning or contradictory rows, if a listing names the part by its file and
-    another file had this key before, or if the sources do not agree, also if only one of them says
-    that it was not checked. Raises DataError if the path of a source is no regular expression with
-    one group.
+    `table` and `part` are the table and the number of the part. The reader of a listing, a file
+    with a row for each part or recording, adds the key that it found to its `used`. Raises
+    UnreadableError if a source has no label for the part, a word without a stated meaning or
+    contradictory rows, or if the sources do not agree, also if only one of them says that it was
+    not checked. Raises it also if another file had the key in a listing before, unless the key is
+    the number of the part, which several files may have. Raises DataError if the path of a source
+    is no regular expression with one group.
     """
     by_source = [reader.label(table, part) for reader in labels]
     for i, label in enumerate(by_source):
