@@ -44,6 +44,7 @@ Floats = NDArray[np.float32]
 Ints = NDArray[np.int64]
 OUTLIER_DISTANCE = 50.0  # times the median distance from the median point
 OUTLIER_SHARE = 0.05  # more points than this share are not outliers
+NO_ROWS: Floats = np.zeros((0, 0), np.float32)
 SMALLEST = 1e-12  # that the largest sample must reach
 SAME_POINTS = 1e-3  # by which points of one trace may differ: between machines, compiled, restored
 
@@ -418,6 +419,45 @@ def embed_in_chunks(module: Callable[[Tensor], Tensor], x: Tensor, size: int) ->
     mode that it is in (training or evaluation), and must return float32 (rows, K, d) on the CPU.
     """
     return torch.cat([module(chunk) for chunk in torch.split(x, size)]).numpy()
+
+
+class RowCache:
+    """Rows that were computed from traces, and can be found again by the numbers of their labels.
+
+    Parameters
+    ----------
+    numbers : array of int64, shape (n,), or None
+        Those of the labels, increasing; None: the cache is empty.
+    rows : array of float32, shape (n, p)
+        An array, since it is pickled at less cost than a tensor.
+    """
+
+    def __init__(self, numbers: Ints | None = None, rows: Floats = NO_ROWS) -> None:
+        self.numbers = numbers
+        self._rows = rows
+
+    def update(self, numbers: Ints | None, compute: Callable[[Any], Floats]) -> Floats:
+        """Return the rows of these labels, float32 (m, p), and keep them and no others.
+
+        ``compute(index)`` returns the rows that the cache lacks; the index selects them of m. The
+        numbers (m,), at least one, increase and are not -1, which is not checked; the array is
+        kept, not copied, and so are the rows that are returned. None: all rows are computed, and
+        the cache is neither read nor changed.
+        """
+        if numbers is None:
+            return compute(slice(None))
+        if self.numbers is None:
+            self._rows = compute(slice(None))
+        else:
+            positions = np.searchsorted(self.numbers, numbers)
+            is_new = np.append(self.numbers, -1)[positions] != numbers
+            positions[is_new] = len(self._rows) + np.arange(is_new.sum())
+            rows = np.concatenate([self._rows, compute(is_new)])
+            # A slice copies nothing; it is enough unless a trace in between has left.
+            is_slice = (np.diff(positions) == 1).all()
+            self._rows = rows[positions[0] : positions[-1] + 1] if is_slice else rows[positions]
+        self.numbers = numbers
+        return self._rows
 
 
 def points_in_fold_space(Z: Floats, folds: Ints) -> Floats:

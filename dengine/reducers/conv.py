@@ -246,7 +246,7 @@ class ConvReducer(TorchReducer):
         already.
         """
         probabilities = self.rocket_.train_heads(traces, labels, folds, stop, numbers)  # (n, 1)
-        points = super()._train(traces, labels, folds, stop, steps)
+        points = super()._train(traces, labels, folds, stop, steps, numbers)
         return average_logits(torch.from_numpy(points), torch.from_numpy(probabilities)).numpy()
 
     def embed(self, X: Floats) -> Floats:

@@ -41,6 +41,7 @@ from .base import (
     FitReport,
     Floats,
     Ints,
+    RowCache,
     StopRule,
     check_classes,
     check_integers,
@@ -161,7 +162,8 @@ class Tower(NamedTuple):
     ) -> Self:
         """Compute the principal components of features, and classifier heads on the components.
 
-        The heads are the ones nearest to given heads on the features themselves.
+        The logits of a head are the least-squares fit, over the rows of `f`, to those of a given
+        head on the features themselves.
 
         Parameters
         ----------
@@ -382,9 +384,7 @@ class RocketReducer(ProbabilityReducer):
         self.n_fits_ = 0
         self.n_component_traces_ = 0
         self.towers_: list[Tower] = []
-        self._numbers = np.zeros(0, dtype=np.int64)  # labels whose features are cached
-        # The features of these, (n, P): an array is pickled at less cost than a tensor.
-        self._raw = np.empty((0, len(encoder.gain)), dtype=np.float32)
+        self._raw = RowCache()  # the unscaled features of the last traces, (n, P)
 
     def train_heads(
         self,
@@ -550,18 +550,12 @@ class RocketReducer(ProbabilityReducer):
         """
         encoder = self.net_.encoder
         with torch.no_grad():
-            if numbers is None:
-                return compute_raw_features(encoder, traces)
-            positions = np.searchsorted(self._numbers, numbers)
-            is_new = np.append(self._numbers, -1)[positions] != numbers
-            positions[is_new] = len(self._raw) + np.arange(is_new.sum())
-            new_features = compute_raw_features(encoder, traces[is_new]).numpy()
-            raw = np.concatenate([self._raw, new_features])
-            # A slice copies nothing; it is enough unless a trace in between has left.
-            is_slice = (np.diff(positions) == 1).all()
-            self._raw = raw[positions[0] : positions[-1] + 1] if is_slice else raw[positions]
-            self._numbers = numbers
-        return torch.from_numpy(self._raw)
+            return torch.from_numpy(
+                self._raw.update(
+                    numbers,
+                    lambda index: compute_raw_features(encoder, traces[index]).numpy(),
+                )
+            )
 
     @property
     def report(self) -> FitReport:

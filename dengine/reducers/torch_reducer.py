@@ -49,6 +49,7 @@ from .base import (
     FitReport,
     Floats,
     Ints,
+    RowCache,
     StopRule,
     check_integers,
     draw_seed,
@@ -207,10 +208,11 @@ class TorchReducer(ProbabilityReducer):
         """Train on traces (n, C, T), labels y (n,) 1 or 0, and folds (n,); replace `encoder_`.
 
         It takes `n_steps_due` steps, or fewer if `stop` ends them, and starts from the weights of
-        the last training, or from initial weights the first time. `numbers` is only read by
-        `ConvReducer`, and folds are not checked. Augmentation and randomness are those of
-        `fit_loop`. Returns the points of the traces, float32 (n, d), row i in embedding space
-        ``folds[i]``. Raises the errors of `check_traces`, and SettingError for fewer than two
+        the last training, or from initial weights the first time. `numbers` (n,), those of the
+        labels, increasing, identify the traces: if `stop` allows no step, a trace keeps the point
+        that it had in the last training. Folds are not checked. Augmentation and randomness are
+        those of `fit_loop`. Returns the points of the traces, float32 (n, d), row i in embedding
+        space ``folds[i]``. Raises the errors of `check_traces`, and SettingError for fewer than two
         traces outside a fold, and at the first training for fewer than 20 traces, or a parameter,
         network or checkpoint that cannot be used.
         """
@@ -241,8 +243,8 @@ class TorchReducer(ProbabilityReducer):
         Earlier trainings are discarded; no label is read. The preprocessor averages and scales the
         samples; its scales are computed from the traces. The weights are read from the checkpoint,
         if one is given, and otherwise drawn from the seed. At the end `is_initialized_` becomes
-        True. Raises the errors of `_build`, and SettingError for a checkpoint that cannot be used;
-        then `is_initialized_` is False.
+        True. Raises SettingError for a checkpoint that cannot be used, with `is_initialized_`
+        False, and the errors of `_build`, which leave it as it was.
         """
         x = torch.from_numpy(traces)
         self._build(traces.shape[1], traces.shape[2], averaging(x))
@@ -278,6 +280,7 @@ class TorchReducer(ProbabilityReducer):
         self.averaged_members_ = copy.deepcopy(self.members_)
         self.optimizer_state_: dict[int, dict[str, Tensor]] = {}
         self.why_no_module_ = None  # until it was tried
+        self._points = RowCache()  # by `encoder_`, of the traces of the last training
         self.is_initialized_ = False  # until scales and checkpoint are read
         self.n_steps_ = 0
         self.n_steps_left_ = 0
@@ -300,22 +303,38 @@ class TorchReducer(ProbabilityReducer):
         """Take `steps` steps on traces (n, C, T), or fewer if `stop` ends them; replace `encoder_`.
 
         `fit_loop` takes the steps, and its docstring says what they change. Then the networks with
-        averaged weights and new statistics of batch normalisation become `encoder_`, also if no
-        step was taken. `n_steps_left_` becomes 0 if `stop.max_steps` is set, else the number of
-        steps that are missing until training is complete. `labels` (n,) are 1 or 0, `folds` (n,)
-        the folds, 0 to K - 1; `numbers` is not read. Returns the points of the traces, float32
-        (n, d), row i in embedding space ``folds[i]``. Raises SettingError for fewer than two traces
-        outside a fold; `encoder_` and the counts of steps stay then.
+        averaged weights and new statistics of batch normalisation become `encoder_`. But if `stop`
+        allows no step at all, `encoder_` stays, and of the traces that were in the last training,
+        which `numbers` (n,), those of the labels, tell, the points are those of that training; this
+        needs `numbers` in both. `n_steps_left_` becomes 0 if `stop.max_steps` is set, else the
+        number of steps that are missing until training is complete. `labels` (n,) are 1 or 0,
+        `folds` (n,) the folds, 0 to K - 1. Returns the points of the traces, float32 (n, d), row i
+        in embedding space ``folds[i]``. Raises SettingError for fewer than two traces outside a
+        fold; `encoder_` and the counts of steps stay then.
         """
-        with torch.no_grad():
-            x: Tensor = self.preprocessor_(torch.from_numpy(traces))
-        self.fit_loop(x, torch.from_numpy(labels).float(), folds, stop, steps)
+        if numbers is not None and self._points.numbers is not None and stop.exhausted(0):
+            self.n_new_steps_ = 0
+            self.loss_ = float("nan")
+            points = self._points.update(
+                numbers, lambda i: self._embed_in_fold_space(self._preprocess(traces[i]), folds[i])
+            )
+        else:
+            x = self._preprocess(traces)
+            self.fit_loop(x, torch.from_numpy(labels).float(), folds, stop, steps)
+            self.estimate_statistics(x)
+            self.encoder_ = self._new_encoder()
+            points = self._embed_in_fold_space(x, folds)
+            self._points = RowCache(numbers, points)
         n_missing = self._n_steps_wanted(len(labels)) - self.n_steps_
         # A caller who limits the steps of a retrain wants no further retrains in their place.
         self.n_steps_left_ = max(0, n_missing) if stop.max_steps is None else 0
-        self.estimate_statistics(x)
-        self.encoder_ = self._new_encoder()
-        return self._embed_in_fold_space(x, folds)
+        return points
+
+    @torch.no_grad()
+    def _preprocess(self, traces: Floats) -> Tensor:
+        """Average and standardise traces (n, C, T) by `preprocessor_`: float32 (n, C', L)."""
+        x: Tensor = self.preprocessor_(torch.from_numpy(traces))
+        return x
 
     def fit_loop(self, x: Tensor, y: Tensor, folds: Ints, stop: StopRule, steps: int) -> None:
         """Take AdamW steps on augmented batches, copy k of the network on the rows outside fold k.

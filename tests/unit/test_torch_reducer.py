@@ -115,6 +115,21 @@ def test_no_step_begins_after_the_deadline_and_the_reducer_answers_all_the_same(
     assert np.isfinite(reducer.embed(X)).all()
 
 
+@pytest.mark.parametrize("make", [quick, own_reducer], ids=["conv", "own network"])
+def test_without_time_for_a_step_known_traces_keep_their_points_and_new_ones_are_embedded(make):
+    reducer = make()
+    folds = content_fold(X, reducer.folds)
+    numbers = np.arange(60) * 2
+    reducer.train(X[:40], Y[:40], folds[:40], numbers=numbers[:40])
+    late = StopRule(deadline=0.0)
+    points = reducer.train(X[10:], Y[10:], folds[10:], late, numbers[10:])
+    assert reducer.report.n_steps == 0
+    np.testing.assert_allclose(points, reducer.embed_references(X[10:], folds[10:]), atol=1e-5)
+    trained = reducer.train(X, Y, folds, numbers=numbers)
+    np.testing.assert_allclose(trained, reducer.embed_references(X, folds), atol=1e-5)
+    assert not np.allclose(trained[10:], points)
+
+
 def test_a_conv_that_was_stored_without_rocket_is_refused_with_what_to_do():
     state = quick().fit(X, Y).get_state()
     old = {name: array for name, array in state.items() if not name.startswith("rocket.")}
