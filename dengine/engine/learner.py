@@ -251,8 +251,7 @@ class Learner:
 
         In a product a newer version and corrections of labels of other cells are put in force
         first, so a peer's version may be in force afterwards, even if nothing is trained here. They
-        are looked for once a second, and in each call while `retrain_every` labels are new and no
-        version is pinned, even if there are too few labels for a training.
+        are looked for once a second, and whenever a training can begin because labels are new.
 
         Parameters
         ----------
@@ -270,20 +269,17 @@ class Learner:
             preparation is under way, or if the executor now trains.
         """
         peers = self._peers
-        may_train = self.feedback.new_labels >= retrain_every and not self.live.pinned
+        may_train = self._has_labels(retrain_every) and not (self.live.pinned or self.is_at_work)
         if peers is not None and (may_train or peers.is_look_due):
             self._try_to_hear(peers, with_labels=False)
         if self.live.pinned:
             self._is_requested = False
             return None
-        n_new = self.feedback.new_labels
-        n_labels = max(n_new, len(self._window))
-        is_due = n_new >= retrain_every and n_labels >= self.live.newest.min_traces
         # A training may have ended by its budget, as after a large import; then another begins
         # without new labels. Peers would each train the same version, so they wait for labels.
         is_alone = peers is None and self._was_accepted
         lacks_steps = is_alone and self.live.lacks_steps and not (once and self._report is not None)
-        if not (is_due or lacks_steps or self._is_requested):
+        if not (self._has_labels(retrain_every) or lacks_steps or self._is_requested):
             return None
         if self._outbox.fault:
             return None
@@ -291,6 +287,12 @@ class Learner:
             return self.retrain(wait=False)
         except StoreError:  # logged by the outbox; the labels wait in its journal
             return None
+
+    def _has_labels(self, retrain_every: int) -> bool:
+        """Return whether so many labels are new, and there are as many as a training needs."""
+        n_new = self.feedback.new_labels
+        n_labels = max(n_new, len(self._window))
+        return n_new >= retrain_every and n_labels >= self.live.newest.min_traces
 
     @property
     def is_swapping(self) -> bool:

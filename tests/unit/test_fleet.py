@@ -132,6 +132,17 @@ def numbers(engine: DataEngine) -> list[int]:
     return sorted(engine.model.index.column("numbers").tolist())
 
 
+def test_a_cell_with_too_few_labels_for_a_training_asks_the_store_no_more_than_once_a_second(
+    fleet, parts, monkeypatch
+):
+    engine = fleet.engine("a", recipe=CONV.with_settings(retrain_every=2), clock=lambda: 7.0)
+    asked, newest = [], engine.store.versions.newest_number
+    monkeypatch.setattr(engine.store.versions, "newest_number", lambda: asked.append(1) or newest())
+    learn(engine, parts, range(12))
+    assert engine.state.new_labels == 12
+    assert len(asked) <= 1
+
+
 @pytest.mark.parametrize(
     "recipe",
     [RECIPE, replace(RECIPE, reducer=PCA(2)), pytest.param(CONV, marks=pytest.mark.slow)],
