@@ -49,8 +49,8 @@ def check_cell(cell: Any) -> None:
     """Raise SettingError for an object that lacks a method of `Cell`; no method is called.
 
     The message names the missing methods. An attribute that `inspect.getattr_static` finds counts
-    as a method unless it is None; it is not read, so that no code of the cell runs. An attribute
-    that is not found in this way is read and must be callable.
+    as a method unless it is None; it is not read, so that no code of the robot cell runs. An
+    attribute that is not found in this way is read and must be callable.
     """
     # Static look-up first: a cell may react to the reading of its attributes.
     missing = [

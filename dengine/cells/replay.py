@@ -79,7 +79,7 @@ class ReplayCell:
     def proceed(self) -> Outcome:
         """Return STOPPED if the newest part is bad; nothing changes.
 
-        For a good one return CONFIRMED if the cell was made with `confirm`, and else UNKNOWN.
+        For a good one return CONFIRMED if the robot cell was made with `confirm`, and else UNKNOWN.
         """
         if not self.truth:
             return Outcome.STOPPED

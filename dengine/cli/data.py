@@ -265,7 +265,7 @@ def train(
     cannot be stored, or has no label to train on), or if training steps are missing at the end,
     because ten retrains in a row had no time for a single step. If steps are missing, and after
     Ctrl-C, which keeps what was imported, the same command continues there. The subcommand is
-    refused while an engine runs on the cell.
+    refused while an engine runs on the robot cell.
     """
     from ..datasets.importing import import_labelled, in_form_of
     from ..engine.engine import DataEngine

@@ -64,11 +64,11 @@ def export(
     any of these three exists, --force is needed; without a key, --force removes an old FILE.sig. An
     existing key is never replaced. --cpp writes the C and C++ sources that run such a file.
 
-    STORE is the engine's store, as given to `dengine train` or `dengine run`; the cell may run
-    meanwhile, and an event records the export. But the exported file never learns the outcome of a
-    part that was accepted and whose outcome is not known yet. Before the first retrain there is
-    nothing to export, and the exit code is 1. It is 1, too, for a model that you handed in, for an
-    interval other than wilson and binomial, and for a reducer or rule that runs in Python only,
+    STORE is the engine's store, as given to `dengine train` or `dengine run`; the robot cell may
+    run meanwhile, and an event records the export. But the exported file never learns the outcome
+    of a part that was accepted and whose outcome is not known yet. Before the first retrain there
+    is nothing to export, and the exit code is 1. It is 1, too, for a model that you handed in, for
+    an interval other than wilson and binomial, and for a reducer or rule that runs in Python only,
     like umap-learn or a scikit-learn transformer. For onnx it is also 1 if the engine audits, is in
     shadow mode, has force limits or another guarantee than local with stops some, or has a part
     among its references more than once. STORE needs --out, and --out needs STORE; --make-key and

@@ -200,7 +200,8 @@ def drop_none(**values: Any) -> Values:
 
 
 def _address(store: str | None, cell_id: str | None, product: str | None = None) -> str | None:
-    """Return a store's address: its file or URL, or a `CellAddress` if a cell or product is named.
+    """Return a store's address: its file or URL, or a `CellAddress` if a robot cell or product is
+    named.
 
     A `CellAddress` has the file or URL and these names; if only a product is named, the cell is
     "cell". The address is None without a store; a cell or product is a usage error then.
@@ -238,8 +239,8 @@ def store_option(text: str, *names: str, required: bool = False) -> Option:
     """Return a decorator that adds `--store`, `--cell-id` and `--product` to a subcommand.
 
     The subcommand gets them as one address, its argument `store`; whether the store exists is not
-    checked. The address is None without `--store`. A cell or product without `--store` is a usage
-    error.
+    checked. The address is None without `--store`. A robot cell or product without `--store` is a
+    usage error.
 
     Parameters
     ----------
@@ -661,7 +662,7 @@ def data_options(
         The data set is the subcommand's argument DATA, required, instead of an option; `default` is
         not used.
     live : bool, default False
-        Whether to add the options of live traces, those that a cell records now: `--rate-hz`,
+        Whether to add the options of live traces, those that a robot cell records now: `--rate-hz`,
         `--unit`, `--fit` and `--trigger`.
     """
     metavar = "NAME|FILE|FOLDER"
@@ -709,7 +710,8 @@ def recorder_settings(options: Options) -> tuple[Values, TraceSpec]:
 
 
 def trace_spec_from(options: Options) -> TraceSpec | None:
-    """Return the `TraceSpec` that the options in `TRACE` state of live traces, those of a cell.
+    """Return the `TraceSpec` that the options in `TRACE` state of live traces, those of a robot
+    cell.
 
     If `--channels` is one whole number, this is the number of channels; otherwise it has their
     names. Without it there is one channel.

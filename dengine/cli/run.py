@@ -85,7 +85,7 @@ def run(
     out: Out | None,
     **cell_settings: Any,
 ) -> None:
-    """Drive a cell: verify, learn, and verify less.
+    """Drive a robot cell: verify, learn, and verify less.
 
     With a store that exists the engine continues where it was. If you give an option of the recipe,
     the whole recipe (conv, if you name no other) must be the store's; otherwise the store's recipe
@@ -156,8 +156,8 @@ def run(
 def _drive(
     engine: DataEngine, cell: Cell, cycles: int, name: str
 ) -> tuple[Replay, list[Record], CellError | None]:
-    """Let the engine drive the cell with a progress bar named `name`; return the finished cycles,
-    the changes of safe mode, and what ended the run if the cell failed.
+    """Let the engine drive the robot cell with a progress bar named `name`; return the finished
+    cycles, the changes of safe mode, and what ended the run if the cell failed.
 
     A change has the `cycle` after which safe mode began or ended, and its `reason`, "" if it ended.
 
@@ -203,7 +203,7 @@ def _safe_mode_line(change: Record) -> str:
 
 
 def _simulated_cell(scenario: str, cycles: int, source: DataChoice, **others: Any) -> CellToDrive:
-    """Return the `TraceSpec` of the simulated cell, and a function that makes the cell.
+    """Return the `TraceSpec` of the simulated cell, and a function that makes the robot cell.
 
     The `TraceSpec` is the simulation's own, or what the options of `source` state; rate, unit and
     names of channels that these leave out are then the simulation's, if the shape is the same. The
@@ -235,7 +235,7 @@ def _simulated_cell(scenario: str, cycles: int, source: DataChoice, **others: An
 
 
 def _replay_cell(source: DataChoice, cycles: int, **others: Any) -> CellToDrive:
-    """Return the `TraceSpec` of a recording, and a function that makes a cell which plays it.
+    """Return the `TraceSpec` of a recording, and a function that makes a robot cell which plays it.
 
     The recording is the data set of `source`, and is loaded at once. The cell begins after the last
     part that was played before. A part was played before if its trace equals one that has a label
@@ -252,8 +252,8 @@ def _replay_cell(source: DataChoice, cycles: int, **others: Any) -> CellToDrive:
     dataset = source.load()
 
     def make(engine: DataEngine) -> tuple[Cell, str]:
-        """Return the parts after the last one that this engine's store knows as a cell, and its
-        name; SettingError if fewer than `cycles` are left.
+        """Return the parts after the last one that this engine's store knows as a robot cell, and
+        its name; SettingError if fewer than `cycles` are left.
         """
         store = engine.store
         # By the content of the traces: the store's own hash is one number for a part that comes
@@ -282,8 +282,9 @@ def _robot_cell(source: DataChoice, host: str | None, **others: Any) -> CellToDr
     """Return the `TraceSpec` of a robot, and a function that connects to it and makes its cell.
 
     The robot is a Universal Robots controller at `host`, HOST or HOST:PORT. The options of `source`
-    say what is recorded, and when; `others` are settings of other kinds of cell, and are ignored.
-    Nothing is connected before the function is called. The cell's `close` ends the connection.
+    say what is recorded, and when; `others` are settings of other kinds of robot cell, and are
+    ignored. Nothing is connected before the function is called. The cell's `close` ends the
+    connection.
 
     Raises
     ------
@@ -350,13 +351,13 @@ COLUMNS = {  # title -> count of a stretch
 def _print_run(replay: Replay, record: Record, cell: Any, out: Out | None) -> None:
     """Print the result of a run: a table of stretches, the cell's own report, and sentences.
 
-    A stretch is a number of consecutive cycles. The cell's own report is shown if the cell has a
-    method `report`. The sentences say how much time was saved (the checks left out, less 120 s for
-    each line stop and 47.5 s for each rejected good part), how the retrains went, when safe mode
-    began and ended, and what share of the accepted parts was bad at most (the certificate). The
-    counts are added to `record`, which has the rest, in place, and `--json` prints it in place of
-    all that. run.csv and run.png are written to `out`, if it is given; OutputError, if that fails,
-    is raised after the printing.
+    A stretch is a number of consecutive cycles. The cell's own report is shown if the robot cell
+    has a method `report`. The sentences say how much time was saved (the checks left out, less 120
+    s for each line stop and 47.5 s for each rejected good part), how the retrains went, when safe
+    mode began and ended, and what share of the accepted parts was bad at most (the certificate).
+    The counts are added to `record`, which has the rest, in place, and `--json` prints it in place
+    of all that. run.csv and run.png are written to `out`, if it is given; OutputError, if that
+    fails, is raised after the printing.
     """
     from ..experiments.figures import curves
     from ..experiments.metrics import Costs

@@ -193,7 +193,7 @@ def _open_engine(
 
     The engine trains in `executor`, and logs when safe mode begins or ends. If `shadow` is True,
     shadow mode, which verifies every part, is turned on, and stays on in the store. `seed` is the
-    seed of a new store's engine, None for that of another cell of its product, or 0; if it is
+    seed of a new store's engine, None for that of another robot cell of its product, or 0; if it is
     given, a used store must have the same seed. `settings` are further arguments of
     `DataEngine.open_or_create`. Raises what that method raises, and what `DataEngine.set_shadow`
     raises; in the second case the engine stays open.

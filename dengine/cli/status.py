@@ -55,12 +55,12 @@ def status(store: str, last: int, check_seconds: float) -> None:
     """Show how an engine is doing, and what its store holds.
 
     STORE is the file or URL of the engine's store, as given to `dengine train` or `dengine run`,
-    and must exist. An engine may run on it meanwhile. If it holds several cells and none is named,
-    they are only listed; cells of one product share labels and versions. A damaged label or version
-    that is read is recorded as an event. The interval of bad accepted parts is valid if you look
-    once; the certificate, which bounds their share, is valid however often you look. If the model
-    was certain of parts that were verified, like in shadow mode, a line says how much time it would
-    have saved, at `--check-seconds` for each check.
+    and must exist. An engine may run on it meanwhile. If it holds several robot cells and none is
+    named, they are only listed; cells of one product share labels and versions. A damaged label or
+    version that is read is recorded as an event. The interval of bad accepted parts is valid if you
+    look once; the certificate, which bounds their share, is valid however often you look. If the
+    model was certain of parts that were verified, like in shadow mode, a line says how much time it
+    would have saved, at `--check-seconds` for each check.
     """
     from ..history.status import status as read_status
     from ..representation import to_jsonable
@@ -113,7 +113,7 @@ def _overview_table(store: str, report: "Status") -> Any:
 def _present_rows(report: "Status") -> list[tuple[str, str]]:
     """Return rows of a table, (title, text), on the present state of an engine, an alarm first.
 
-    They are the cell; the fields of the status that are not empty, except those in
+    They are the robot cell; the fields of the status that are not empty, except those in
     `SHOWN_ELSEWHERE` and those that only a running engine knows; the recipe; the `TraceSpec`; the
     certificate on accepted and on rejected parts; the last and the slowest retrain; and the newest
     events, with a row for each, the newest first. An alarm, or a retrain, has a row only if there

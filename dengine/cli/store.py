@@ -63,8 +63,8 @@ def store_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """Add STORE, `--cell`, `--author` and `--allow-import`, for a subcommand that changes an
     engine.
 
-    Returns the command with these options; STORE and the cell reach it as one address, `store`. The
-    author is the login name if none is given, or "" if the system has none.
+    Returns the command with these options; STORE and the robot cell reach it as one address,
+    `store`. The author is the login name if none is given, or "" if the system has none.
     """
     return options.store_argument(options.allow_import_option(author_option(command)))
 
@@ -79,8 +79,8 @@ def _change_and_print(
     instead, which also has the policy and the certificate after the change. `allow_import` permits
     to import the reducer or rule, module:Class, that the store names. The engine waits up to 10 s
     for the disk or database. Raises the errors of `DataEngine.open` (StoreError if an engine runs
-    on the cell), those of `certificate`, and whatever `change` raises; nothing is printed then. An
-    error of `certificate` comes after the change, which stays.
+    on the robot cell), those of `certificate`, and whatever `change` raises; nothing is printed
+    then. An error of `certificate` comes after the change, which stays.
     """
     from ..engine.engine import DataEngine
     from ..store.opening import LONG_WAIT
@@ -113,8 +113,8 @@ def report(part: str, label: str, **changing: Any) -> None:
     has already, reported or corrected, changes nothing. Another label is refused with exit code 1,
     unless it is a line stop after a confirmation, and so is any label after `dengine forget`;
     `dengine correct` puts either right. Only the newest 20 decisions on the part are looked at. The
-    subcommand is refused while an engine runs on the cell. A store that names a reducer or rule of
-    your own, module:Class, needs --allow-import.
+    subcommand is refused while an engine runs on the robot cell. A store that names a reducer or
+    rule of your own, module:Class, needs --allow-import.
     """
     from ..engine.corrections import Changed
     from ..history.explain import find_decision_id
@@ -150,7 +150,7 @@ def correct(part: str, label: str, **changing: Any) -> None:
     label. The label as it was reported stays in the store, and so does the decision; the correction
     is a later row, and an event. A label that `dengine forget` left out counts again. If this label
     counts already, nothing changes. An unknown decision, and one without a label, is refused with
-    exit code 1. The subcommand is refused while an engine runs on the cell.
+    exit code 1. The subcommand is refused while an engine runs on the robot cell.
     """
     from ..history.explain import find_decision_id
 
@@ -172,7 +172,7 @@ def forget(decisions: tuple[str, ...], reason: str, **changing: Any) -> None:
     Nothing is deleted: traces and labels stay in the store, and `dengine correct` brings a label
     back. If one of the decisions is unknown or has no label, none is forgotten, and the exit code
     is 1. A pinned version that was trained with one of them is released. The subcommand is refused
-    while an engine runs on the cell.
+    while an engine runs on the robot cell.
     """
     _change_and_print(
         lambda engine, author: engine.forget(*decisions, author=author, reason=reason), **changing
@@ -189,7 +189,7 @@ def rollback(version: int, **changing: Any) -> None:
     automatic retrain replaces it, until `dengine release` or `dengine retrain`, or until a label
     that it was trained with is forgotten. A version that is not kept is refused; the message has
     the numbers of the versions that are kept. The subcommand is refused while an engine runs on the
-    cell.
+    robot cell.
     """
     _change_and_print(lambda engine, author: engine.rollback(version, author), **changing)
 
@@ -199,7 +199,8 @@ def rollback(version: int, **changing: Any) -> None:
 def release(**changing: Any) -> None:
     """Let retrains replace the version that `rollback` pinned.
 
-    If none is pinned, nothing changes. The subcommand is refused while an engine runs on the cell.
+    If none is pinned, nothing changes. The subcommand is refused while an engine runs on the robot
+    cell.
     """
     _change_and_print(lambda engine, author: engine.release(author), **changing)
 
@@ -214,17 +215,17 @@ def release(**changing: Any) -> None:
 def policy(store: str, settings: dict[str, Any], author: str, allow_import: bool) -> None:
     """Show the policy in force, or change it.
 
-    Without options it is shown, even while an engine runs on the cell; a change is refused then. A
-    change is recorded as an event; settings that are in force already change nothing. A setting
-    that is not given stays as it is, but --prices without --guarantee also changes the guarantee
-    local or pooled to cost, and then an audit rate of 0 to 0.05, unless --audit-rate is given.
-    Earlier decisions keep their bounds. The certificate, which bounds the share of wrong decisions,
-    starts again after any change. The rule also forgets what it learned, after a change of --alpha,
-    --lower-bound, --interval, --guarantee, --stops or --prices, and, under pooled or cost with
-    --stops some, of --audit-rate: a tolerance that is chosen after the data was seen needs fresh
-    evidence. A store whose engine needs a model or reducer that was handed in as an object is
-    refused, with and without options. Shadow mode lasts over restarts; `dengine status` counts what
-    the model would have done, and how much of it was wrong.
+    Without options it is shown, even while an engine runs on the robot cell; a change is refused
+    then. A change is recorded as an event; settings that are in force already change nothing. A
+    setting that is not given stays as it is, but --prices without --guarantee also changes the
+    guarantee local or pooled to cost, and then an audit rate of 0 to 0.05, unless --audit-rate is
+    given. Earlier decisions keep their bounds. The certificate, which bounds the share of wrong
+    decisions, starts again after any change. The rule also forgets what it learned, after a change
+    of --alpha, --lower-bound, --interval, --guarantee, --stops or --prices, and, under pooled or
+    cost with --stops some, of --audit-rate: a tolerance that is chosen after the data was seen
+    needs fresh evidence. A store whose engine needs a model or reducer that was handed in as an
+    object is refused, with and without options. Shadow mode lasts over restarts; `dengine status`
+    counts what the model would have done, and how much of it was wrong.
     """
     if settings:
         _change_and_print(
@@ -255,7 +256,7 @@ def retrain(store: str, author: str, allow_import: bool) -> None:
     ends before the training does, the output says how many steps are to go, and the next retrain
     continues. If the training fails or has no label to train on, or the new version fails its tests
     or cannot be stored, it is dropped, the previous version stays in use, and the exit code is 1.
-    The subcommand is refused while an engine runs on the cell.
+    The subcommand is refused while an engine runs on the robot cell.
     """
     from ..engine.engine import DataEngine
     from ..experiments.tables import retrain_line
@@ -387,13 +388,13 @@ def _verification_lines(report: HistoryReport) -> list[str]:
 def backup(store: str, out: Path) -> None:
     """Copy a store while it is in use.
 
-    The copy is one file with all cells and with the contents of the journals that lie beside the
-    store, which a plain copy of the file lacks. It can be opened, and checked by `dengine verify`,
-    wherever it is. Damaged records of a journal are left out, and a record that contradicts the
-    store becomes an event of kind "dead letter" in the copy. Cells without a journal are named. A
-    store in PostgreSQL is refused (pg_dump copies it), and so are an --out that exists, a journal
-    that cannot be read, and one with records, if the cell's ledger has another key than the file
-    that DENGINE_LEDGER_KEY names.
+    The copy is one file with all robot cells and with the contents of the journals that lie beside
+    the store, which a plain copy of the file lacks. It can be opened, and checked by `dengine
+    verify`, wherever it is. Damaged records of a journal are left out, and a record that
+    contradicts the store becomes an event of kind "dead letter" in the copy. Cells without a
+    journal are named. A store in PostgreSQL is refused (pg_dump copies it), and so are an --out
+    that exists, a journal that cannot be read, and one with records, if the cell's ledger has
+    another key than the file that DENGINE_LEDGER_KEY names.
     """
     from ..store.backup import backup_store
 
@@ -425,11 +426,11 @@ def restore(copy: str, store: Path) -> None:
     COPY is what `dengine backup` wrote, on this or another machine. It is checked first; if
     `dengine verify` would find a fault in it, even lost data alone that nobody has acknowledged, if
     its ledger has another key than the file that DENGINE_LEDGER_KEY names, or if --store exists, it
-    is refused with exit code 1. Beside --store each cell gets a journal. It names the newest entry
-    of the cell's ledger, by which the next engine sees that the store is complete. A journal that
-    is there already stays, and that engine takes from it what the copy lacks; if the journal names
-    entries that the copy lacks, it raises an alarm. Records of journals beside COPY are added to
-    the store. If a journal cannot be made, the exit code is 1, and the store stays.
+    is refused with exit code 1. Beside --store each robot cell gets a journal. It names the newest
+    entry of the cell's ledger, by which the next engine sees that the store is complete. A journal
+    that is there already stays, and that engine takes from it what the copy lacks; if the journal
+    names entries that the copy lacks, it raises an alarm. Records of journals beside COPY are added
+    to the store. If a journal cannot be made, the exit code is 1, and the store stays.
     """
     from ..store.backup import restore_store
 
@@ -463,7 +464,7 @@ def import_labels(journal: Path, store: str, any_model: bool) -> None:
     If a line was changed or is missing, the lines before it are imported, the others are not, and
     the exit code is 1. A file that is no journal, has no accepted or labelled part, has a line that
     cannot be read, or belongs to another model (unless --any-model, or the store records no export)
-    is refused as a whole. The subcommand is refused while an engine runs on the cell.
+    is refused as a whole. The subcommand is refused while an engine runs on the robot cell.
     """
     from ..export.cell_journal import import_journal
 

@@ -76,7 +76,8 @@ class MemberRule(DecisionRule):
 
 
 class WatchedRule(MemberRule):
-    """The paper's rule with a safe mode, for cells where silence after an accept means success.
+    """The paper's rule with a safe mode, for robot cells where silence after an accept means
+    success.
 
     A part is accepted if lower >= LB and rejected if upper <= 1 - LB. After an alarm of a drift
     detector it does neither, until the outcomes since then show recovery (`MemberEvidence`). The

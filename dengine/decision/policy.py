@@ -70,7 +70,8 @@ class Policy:
     label_within : int, default 1000
         A check, or an audit, is overdue if it has no report within this number of later decisions.
         Until it is reported it counts as a wrong decision, in the certificate and in the rule. The
-        unit is decisions, not seconds: a cell may stand still, and a replay gives the same result.
+        unit is decisions, not seconds: a robot cell may stand still, and a replay gives the same
+        result.
     force_limits : tuple of ForceLimits or str, default ()
         The operator's limits beside the model. A trace that leaves one of them is verified or
         rejected, whatever the model says (`Reason.OUTSIDE`). No claim counts this trace.

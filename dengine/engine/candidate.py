@@ -129,8 +129,8 @@ class Candidate:
     def end_storing(self, version: int) -> None:
         """Note that the version is stored, and put the number that it got there in the report.
 
-        It differs from the report's number if another cell of the product stored a version first.
-        With `version` 0 the report keeps its number.
+        It differs from the report's number if another robot cell of the product stored a version
+        first. With `version` 0 the report keeps its number.
         """
         self.is_stored = True
         self.report = replace(self.report, version=version or self.report.version)

@@ -125,7 +125,7 @@ class Corrections:
             For an unknown decision, for a decision without a label, and for a `success` that is no
             label.
         StoreError
-            If the store does not answer, the decision's trace is damaged, another cell of the
+            If the store does not answer, the decision's trace is damaged, another robot cell of the
             product stores a version meanwhile and a pinned baseline is to be fitted again, or the
             engine is closed, was opened for reading or before a fork. A change that was stored
             before the error stays stored.
@@ -180,10 +180,10 @@ class Corrections:
             For an unknown decision, for a decision without a label, and if no id is given; then no
             label is forgotten.
         StoreError
-            If the store does not answer, the trace of a decision is damaged, another cell of the
-            product stores a version meanwhile and a pinned one is to be released or fitted again,
-            or the engine is closed, was opened for reading or before a fork. A change that was
-            stored before the error stays stored.
+            If the store does not answer, the trace of a decision is damaged, another robot cell of
+            the product stores a version meanwhile and a pinned one is to be released or fitted
+            again, or the engine is closed, was opened for reading or before a fork. A change that
+            was stored before the error stays stored.
         Exception
             What a baseline raises as it is copied for a retrain or, if it is pinned, fitted again;
             the change is stored then.
@@ -213,11 +213,12 @@ class Corrections:
         """Let retrains replace again the version that `rollback` pinned.
 
         First a trained version is put in force or dropped, labels are stored, and what the
-        product's other cells stored is taken in, even if no version was pinned. The same model goes
-        on, stored as a new version. Labels that came meanwhile count for the next retrain, which
-        may be due at once. A training under way in the executor is discarded, and begins again,
-        even if no version was pinned. If a version was pinned, and a safe mode began or ended
-        meanwhile, an event is recorded, and `on_safe_mode`, the user's function, is called.
+        product's other robot cells stored is taken in, even if no version was pinned. The same
+        model goes on, stored as a new version. Labels that came meanwhile count for the next
+        retrain, which may be due at once. A training under way in the executor is discarded, and
+        begins again, even if no version was pinned. If a version was pinned, and a safe mode began
+        or ended meanwhile, an event is recorded, and `on_safe_mode`, the user's function, is
+        called.
 
         Parameters
         ----------
@@ -282,8 +283,8 @@ class Corrections:
         StoreError
             If the version is not kept (the message names those that are), if traces that it must be
             fitted on are damaged, if this dengine cannot restore it, if the store does not answer,
-            if another cell of the product stores a version meanwhile, or if the engine is closed,
-            was opened for reading or before a fork.
+            if another robot cell of the product stores a version meanwhile, or if the engine is
+            closed, was opened for reading or before a fork.
         Exception
             What a model raises that must be fitted again; for the state of another reducer in rare
             cases KeyError, ValueError or NotImplementedError.
@@ -312,8 +313,8 @@ class Corrections:
         The policy is stored. A trained model goes on under it as a new version; before the first
         training no version is made. Earlier decisions keep their bounds. The call waits for labels
         that are on their way to the store. A training under way in the executor is discarded, and
-        begins again; one that is done is put in force or dropped first. What other cells of the
-        product have stored is taken in first, too.
+        begins again; one that is done is put in force or dropped first. What other robot cells of
+        the product have stored is taken in first, too.
 
         The decision rule turns bounds into actions, and may learn from outcomes. It starts anew if
         alpha, lower_bound, interval, guarantee, stops or prices change. Under the guarantees
@@ -407,8 +408,8 @@ class Corrections:
 
         A trained version is put in force or dropped, and a training that is not done is discarded
         and begins again later. Labels reach the store, and labels, corrections and versions of the
-        product's other cells are taken in. Raises StoreError if the engine is closed, only reads or
-        was opened before a fork, and if the store does not answer.
+        product's other robot cells are taken in. Raises StoreError if the engine is closed, only
+        reads or was opened before a fork, and if the store does not answer.
         """
         self._outbox.check_usable()
         self._learner.bring_up_to_date()
@@ -434,15 +435,15 @@ class Corrections:
     def _change_labels(self, change: Change) -> Changed:
         """Store a change of labels, apply it to references, window and rule; return what was done.
 
-        The outbox drops the changed decisions from its memory, and will read them from the store.
-        A model that cannot change its references is retrained, in this thread, or, if it is pinned,
+        The outbox drops the changed decisions from its memory, and will read them from the store. A
+        model that cannot change its references is retrained, in this thread, or, if it is pinned,
         fitted again as a new version. The store is checked against its ledger; a difference sets
         the outbox's `integrity_error`. If a safe mode begins or ends by this, an event is recorded,
         and `on_safe_mode`, the user's function, is called. Raises StoreError if the store does not
-        answer, or if another cell of the product stores a version while a pinned model is fitted
-        again, and what a model raises as it is copied for a retrain or, if it is pinned, fitted
-        again; a change that is stored by then is applied with the next one, or when the store is
-        opened again.
+        answer, or if another robot cell of the product stores a version while a pinned model is
+        fitted again, and what a model raises as it is copied for a retrain or, if it is pinned,
+        fitted again; a change that is stored by then is applied with the next one, or when the
+        store is opened again.
         """
         number = self._store.corrections.apply(change)
         for id_ in change.decisions:

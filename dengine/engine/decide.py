@@ -68,8 +68,8 @@ class DecisionMaker:
 
         If a `TraceSpec` is in force already, it stays. It only gets from `spec` a rate, units and
         columns that were unknown; a `spec` of another shape is ignored. If none is in force and
-        another cell of the product has set one, its `TraceSpec` is taken in the same way; if it
-        cannot be read, that is logged and `spec` is set.
+        another robot cell of the product has set one, its `TraceSpec` is taken in the same way; if
+        it cannot be read, that is logged and `spec` is set.
 
         A change is saved in the store; if the store does not take it, it is saved with a later
         trace; this is logged. Raises SettingError if the force limits do not fit the `TraceSpec`;
@@ -94,11 +94,11 @@ class DecisionMaker:
         """Return a trace as float32 (channels, samples), in the shape of the `TraceSpec`.
 
         A trace of another length is fitted if the `TraceSpec` says how. If no `TraceSpec` is in
-        force, a trace without a fault sets it; but if another cell of the product has set one, that
-        one is taken, and the trace must fit it. If a `TraceSpec` is in force, but the store did not
-        take the settings, saving them is tried again; a failure is logged. Until the first version
-        is trained, the first finite trace makes the untrained model compile its code for this
-        shape; a failure of this is logged, too.
+        force, a trace without a fault sets it; but if another robot cell of the product has set
+        one, that one is taken, and the trace must fit it. If a `TraceSpec` is in force, but the
+        store did not take the settings, saving them is tried again; a failure is logged. Until the
+        first version is trained, the first finite trace makes the untrained model compile its code
+        for this shape; a failure of this is logged, too.
 
         A trace with NaN, or another fault, is returned like any other, but sets no `TraceSpec`. The
         array that is returned may share its memory with `trace`. Raises TraceError for a wrong

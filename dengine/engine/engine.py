@@ -133,9 +133,9 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         A baseline, no `ModelPrediction`; it decides by its own rule: of a policy only audit_rate,
         stops, label_within, force_limits and shadow count then.
     executor : concurrent.futures.Executor, optional
-        Where retrains run while the cell goes on. None: in the calling thread, between cycles;
-        making the first engine of a process then takes about a second longer, since it loads what a
-        retrain imports.
+        Where retrains run while the robot cell goes on. None: in the calling thread, between
+        cycles; making the first engine of a process then takes about a second longer, since it
+        loads what a retrain imports.
     replaying : bool
         End a retrain by steps alone, never by the clock, so that a seed repeats exactly.
     clock : callable
@@ -219,12 +219,12 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         `template` is the untrained model, and the arguments from `executor` to `on_safe_mode` are
         those of `DataEngine`. Afterwards `_close_forgotten` closes the outbox, and with it a store
         that is not in memory, when the engine is garbage-collected or the program ends. The outbox
-        claims the cell, writes what an earlier process left in the journal to the store, and checks
-        the store (`open_outbox`); version and labels are not restored yet (`_resume`). Without an
-        executor, and unless the engine only reads (`reading`), the modules that a retrain imports
-        are loaded; what that raises, for a reducer of the user's, is raised. Limits this thread to
-        one torch thread. Raises SettingError for force limits in seconds at an unknown rate, and
-        StoreError if another engine owns the cell or the store cannot be used.
+        claims the robot cell, writes what an earlier process left in the journal to the store, and
+        checks the store (`open_outbox`); version and labels are not restored yet (`_resume`).
+        Without an executor, and unless the engine only reads (`reading`), the modules that a
+        retrain imports are loaded; what that raises, for a reducer of the user's, is raised. Limits
+        this thread to one torch thread. Raises SettingError for force limits in seconds at an
+        unknown rate, and StoreError if another engine owns the cell or the store cannot be used.
         """
         recipe = settings.recipe
         check_rate(recipe.policy.force_limits, settings.trace)
@@ -263,13 +263,14 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         The engine then decides bit for bit as before it was closed, with two exceptions: if the
         newest version is damaged, the newest intact one decides, and if the store differs from its
         ledger, every part is verified. A damaged version or trace is reported by an event in the
-        store. A new cell of a product decides by the product's newest version. A model of which the
-        store has only the numbers of its traces is trained on them again; if one of these is
-        damaged or missing, no model is in force. A thread may be started that computes in advance
-        for the next retrain. This method is called once, before the first decision, and waits for
-        the store without a time limit. If retrains run in the calling thread, it also waits until
-        the first retrain can begin without delay. Raises the errors of `LiveModel.resume` and
-        `Feedback.resume`; StoreError if the store cannot be read is one of them.
+        store. A new robot cell of a product decides by the product's newest version. A model of
+        which the store has only the numbers of its traces is trained on them again; if one of these
+        is damaged or missing, no model is in force. A thread may be started that computes in
+        advance for the next retrain. This method is called once, before the first decision, and
+        waits for the store without a time limit. If retrains run in the calling thread, it also
+        waits until the first retrain can begin without delay. Raises the errors of
+        `LiveModel.resume` and `Feedback.resume`; StoreError if the store cannot be read is one of
+        them.
         """
         settings = self._settings.now
         self._learner.resume(settings.recipe.policy.label_within, settings.policy_since)
@@ -320,10 +321,10 @@ class DataEngine(AbstractContextManager["DataEngine"]):
     ) -> Self:
         """Open a store that had an engine; go on with its version and decisions, bit for bit.
 
-        The engine owns the cell until `close`, unless it only reads, and limits this thread to one
-        torch thread. Records that an earlier process left in the journal are written to the store;
-        an engine that only reads leaves them there and does not know them. Rows that are not as
-        they were written are not raised: every part is verified then
+        The engine owns the robot cell until `close`, unless it only reads, and limits this thread
+        to one torch thread. Records that an earlier process left in the journal are written to the
+        store; an engine that only reads leaves them there and does not know them. Rows that are not
+        as they were written are not raised: every part is verified then
         (`EngineState.integrity_error`). If the newest version is damaged, the newest intact one
         decides, and an event in the store says so, also with `reading`. Without an executor, unless
         it only reads, the call also waits until a retrain can begin at once. If it raises, a store
@@ -417,7 +418,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
             name is imported in any case.
         **settings
             As `DataEngine` takes them. For a used store, the given settings must be the settings in
-            force, so that a running cell does not change unnoticed. Of a recipe or policy all
+            force, so that a running robot cell does not change unnoticed. Of a recipe or policy all
             fields are compared, also those at their defaults. The shadow mode, missing force limits
             and arguments that are left out are not compared (`EngineSettings.check_request`). A
             reducer that is an object, `model` and `trace` are as for `open`; `executor`, `clock`,
@@ -467,14 +468,14 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         """Finish a retrain under way, within seconds, write everything, and close the store.
 
         A training that is not done 5 s after this call is dropped. In a product the news of the
-        other cells is taken in before; if it has a correction or a rollback, or the store does not
-        answer, a retrain that is not in force yet is lost. A second call does nothing, nor does one
-        in a forked process. Records that only the database does not take stay in the journal.
-        Records that the disk does not take are given up, and an error is logged; no call has said
-        that they are on disk. If the disk hangs, the store stays open, and no other engine can own
-        the cell until the process ends. With `replaying=True` this waits for the disk and the
-        database without a time limit. A store in memory stays open. Raises StoreError while another
-        thread uses the engine.
+        other robot cells is taken in before; if it has a correction or a rollback, or the store
+        does not answer, a retrain that is not in force yet is lost. A second call does nothing, nor
+        does one in a forked process. Records that only the database does not take stay in the
+        journal. Records that the disk does not take are given up, and an error is logged; no call
+        has said that they are on disk. If the disk hangs, the store stays open, and no other engine
+        can own the cell until the process ends. With `replaying=True` this waits for the disk and
+        the database without a time limit. A store in memory stays open. Raises StoreError while
+        another thread uses the engine.
         """
         with self._exclusive:
             if self._outbox.is_usable:
@@ -547,7 +548,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
             samples, an id that belongs to another trace, and an invalid part number.
         SettingError
             For a first trace that the policy's force limits do not fit, and, while settings are
-            saved, for a `TraceSpec` that contradicts that of another cell of the product.
+            saved, for a `TraceSpec` that contradicts that of another robot cell of the product.
         ReportError
             For an invalid id, and with `timed_out` for none.
         StoreError
@@ -598,13 +599,13 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         has trained is taken one step further (the steps are test, store, put in force; in a product
         all are taken). After the label is learned, a safe mode may begin or end (an event is
         recorded, and `on_safe_mode` is called), and a retrain that is due runs in this thread or
-        begins in the executor. In a product, newer versions and corrections of the other cells may
-        be put in force, too. The label of a trace with a fault is stored; then no retrain follows,
-        and the other cells' news is left for later. If a report or the next decision had confirmed
-        the part as good already, the call also waits for the store, so that the rule is corrected
-        now; if the store does not answer, this happens later. For such a correction a training
-        under way is discarded and begins again, and a model that cannot take a label back, like a
-        handed-in model, is retrained in this thread, or, if it is pinned, fitted again.
+        begins in the executor. In a product, newer versions and corrections of the other robot
+        cells may be put in force, too. The label of a trace with a fault is stored; then no retrain
+        follows, and the other cells' news is left for later. If a report or the next decision had
+        confirmed the part as good already, the call also waits for the store, so that the rule is
+        corrected now; if the store does not answer, this happens later. For such a correction a
+        training under way is discarded and begins again, and a model that cannot take a label back,
+        like a handed-in model, is retrained in this thread, or, if it is pinned, fitted again.
 
         Parameters
         ----------
@@ -655,7 +656,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
             return self._learner.retrain_if_due(self._settings.now.recipe.retrain_every)
 
     def run(self, cell: Cell, cycles: int) -> Iterator[Cycle]:
-        """Drive a cell, and yield a record of each cycle as it happens.
+        """Drive a robot cell, and yield a record of each cycle as it happens.
 
         In each cycle the cell inserts a part, the engine decides, and the cell verifies it, lets it
         go on or rejects it. A known outcome is reported, and retrains happen between cycles. When
@@ -718,7 +719,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
             self.flush(LONG_WAIT)
 
     def _cycle(self, cell: Cell, index: int) -> Cycle:
-        """Have the cell insert one part, decide, do what the decision says, and report the outcome.
+        """Have the robot cell insert one part, decide, do what the decision says, and report the
+        outcome.
 
         `index` is the number of the cycle, from 0. A REJECT is not reported, nor is an ACCEPT if
         the cell does not know its outcome. A label that cannot be written to the disk is logged,
@@ -767,9 +769,9 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         """Retrain now, in this thread, and return the report.
 
         A version that is pinned by a rollback is released first. In a product newer versions,
-        corrections and labels of the other cells are taken in. A retrain that fails, has no label
-        to train on, or cannot be stored, is dropped: the report has `accepted` False then. If a
-        version was pinned, its release announces a safe mode that began or ended; otherwise the
+        corrections and labels of the other robot cells are taken in. A retrain that fails, has no
+        label to train on, or cannot be stored, is dropped: the report has `accepted` False then. If
+        a version was pinned, its release announces a safe mode that began or ended; otherwise the
         next `decide`, `report` or `poll` does. Raises StoreError if the release of a pinned version
         cannot be stored, if the labels that came before cannot be stored, in a product if the store
         does not answer, and for an engine that is closed, was opened for reading or before a fork,
@@ -813,9 +815,9 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         an executor a retrain that is due runs here, also with `brief`. Before a retrain begins,
         also one in the executor, the call waits until the store has all labels; if it does not take
         them in time, or has a fault, the retrain waits for a later call. In a product, newer
-        versions and corrections of the other cells are put in force, which are looked for once a
-        second, and also when a retrain is due or its training is done. If a safe mode began or
-        ended, an event is recorded, and `on_safe_mode` is called.
+        versions and corrections of the other robot cells are put in force, which are looked for
+        once a second, and also when a retrain is due or its training is done. If a safe mode began
+        or ended, an event is recorded, and `on_safe_mode` is called.
 
         Parameters
         ----------

@@ -45,8 +45,8 @@ class Feedback:
     live : LiveModel
         Learns from them.
     window : TrainingWindow
-        Takes each label that is recorded; in a product, whose cells share labels, `fleet.Peers`
-        reads them from the store instead.
+        Takes each label that is recorded; in a product, whose robot cells share labels,
+        `fleet.Peers` reads them from the store instead.
     settings : SettingsInForce
         Whether an accepted part without a report is confirmed by the next decision, and since which
         version.
@@ -266,10 +266,10 @@ class Feedback:
     def number_labels(self) -> None:
         """In a product, give this cell's references the numbers that their labels got in the store.
 
-        A product is several cells whose labels have one sequence of numbers in the store. With or
-        without a product, the rule first counts each check that has become overdue as a wrong
-        decision; if this fails, it is logged, and the rule is stale. The store is not asked: the
-        outbox keeps the numbers of the labels that it has written to the store, and gives each
+        A product is several robot cells whose labels have one sequence of numbers in the store.
+        With or without a product, the rule first counts each check that has become overdue as a
+        wrong decision; if this fails, it is logged, and the rule is stale. The store is not asked:
+        the outbox keeps the numbers of the labels that it has written to the store, and gives each
         number once. Labels of traces with a fault are passed over, and without a model in force no
         reference changes. Nothing is raised.
         """

@@ -23,7 +23,7 @@ LOOK_SECONDS = 1.0  # between two looks for a newer version
 
 
 class Peers:
-    """The other cells of a product, as the store knows them.
+    """The other robot cells of a product, as the store knows them.
 
     Parameters
     ----------
@@ -72,8 +72,8 @@ class Peers:
         """Log that the store gave no answer, or that it answers again.
 
         `error` is that of the last attempt to ask the store for versions and corrections of the
-        product's other cells; None: it answered. Only the first of several failures is logged, and
-        only the first answer after a failure.
+        product's other robot cells; None: it answered. Only the first of several failures is
+        logged, and only the first answer after a failure.
         """
         product = self._outbox.store.product
         if error is None and self._is_lost:
@@ -103,7 +103,8 @@ class Peers:
             self._window.add(trace, label, hash_, seq)
 
     def put_in_force(self, number: int) -> bool:
-        """Put a version that another cell of the product stored in force, with this cell's labels.
+        """Put a version that another robot cell of the product stored in force, with this cell's
+        labels.
 
         It gets the present decision rule of this cell: nothing is rebuilt, and the other cell's
         rule is ignored. A failure to take over the rule is logged, and the version is in force all

@@ -53,7 +53,7 @@ class Learner:
     window : TrainingWindow
     feedback : Feedback
     peers : Peers or None
-        None if the cell shares no product.
+        None if the robot cell shares no product.
     retrainer : Retrainer
     clock : callable
         Seconds, of any origin, by which retrains are timed.
@@ -153,16 +153,16 @@ class Learner:
     def catch_up(self) -> None:
         """Give labels the numbers that the store assigned, and put the rule right if it must be.
 
-        The store assigns numbers only in a product (cells that share labels and versions). Checks
-        whose report is overdue count as wrong, too. The rule must be put right (`Feedback.remedy`)
-        after it learned a wrong outcome: it is rebuilt, or all corrections that the store has by
-        now are applied and it is rebuilt. This waits for a later call while the store lacks any
-        record or has a fault. Before a correction a retrain under way is ended (`end_training`),
-        and the store is checked against its ledger (its hash chain): after a difference every part
-        is verified. A model that cannot change its references is retrained here, or, if it is
-        pinned, fitted again. Nothing is raised: if the store fails meanwhile, that is logged, and a
-        later call tries again; any other exception, for example of a model that is fitted again, is
-        logged, and it is not tried again.
+        The store assigns numbers only in a product (robot cells that share labels and versions).
+        Checks whose report is overdue count as wrong, too. The rule must be put right
+        (`Feedback.remedy`) after it learned a wrong outcome: it is rebuilt, or all corrections that
+        the store has by now are applied and it is rebuilt. This waits for a later call while the
+        store lacks any record or has a fault. Before a correction a retrain under way is ended
+        (`end_training`), and the store is checked against its ledger (its hash chain): after a
+        difference every part is verified. A model that cannot change its references is retrained
+        here, or, if it is pinned, fitted again. Nothing is raised: if the store fails meanwhile,
+        that is logged, and a later call tries again; any other exception, for example of a model
+        that is fitted again, is logged, and it is not tried again.
         """
         self.feedback.number_labels()
         remedy = self.feedback.remedy
@@ -198,8 +198,8 @@ class Learner:
 
         First every label is stored, since a version is trained only on labels that the store has
         numbered. Then the call waits for what is computed in advance, and takes in what the
-        product's other cells stored (a newer version, corrections and labels), since these may
-        change what the training starts from. Then new labels count from zero, and the training
+        product's other robot cells stored (a newer version, corrections and labels), since these
+        may change what the training starts from. Then new labels count from zero, and the training
         begins. Whether a rollback pinned the version in force is not checked.
 
         With `wait` True, or if no executor takes work (none is there, or it died or hangs), all is
@@ -244,10 +244,10 @@ class Learner:
         There are three reasons. First, `retrain_every` labels are new, and there are as many labels
         as the model needs for a training (`min_traces`). Second, the training of the version in
         force made some of its steps and not all, for example because the time budget ended it; this
-        is a reason only in a cell without a product, and only if the last retrain was not dropped.
-        Third, a retrain was requested earlier and could not begin then, or a training was discarded
-        and is to begin again. A pinned version is not replaced, and such a request is withdrawn.
-        What the copying of a model that the user handed in raises is raised.
+        is a reason only in a robot cell without a product, and only if the last retrain was not
+        dropped. Third, a retrain was requested earlier and could not begin then, or a training was
+        discarded and is to begin again. A pinned version is not replaced, and such a request is
+        withdrawn. What the copying of a model that the user handed in raises is raised.
 
         In a product a newer version and corrections of labels of other cells are put in force
         first, so a peer's version may be in force afterwards, even if nothing is trained here. They
@@ -340,7 +340,7 @@ class Learner:
         store does not take now, waits for a later call. Nothing is raised.
 
         `wait` is the number of seconds to wait for a training that is not done; after that it is
-        given up, and so is a training that hangs. In a product (cells that share labels and
+        given up, and so is a training that hangs. In a product (robot cells that share labels and
         versions) all steps are taken in any case. When the training is done, or with `wait` above
         0, the call first takes in what the other cells stored: a correction or a rollback discards
         the training, and if the store is unavailable, the training waits for a later call.
@@ -477,8 +477,8 @@ class Learner:
         logged and skipped. Each round first counts overdue checks and, in a product, takes over the
         labels' numbers (`number_labels`). It yields None after each label, and a function that
         waits for the store if labels are not stored yet; it ends when no label is missing or waits
-        to be stored. In a cell that never pauses some label always waits, so in every 20th round
-        this call waits for the store itself; a StoreError there is ignored.
+        to be stored. In a robot cell that never pauses some label always waits, so in every 20th
+        round this call waits for the store itself; a StoreError there is ignored.
         """
         for n_waits in count(1):
             self.feedback.number_labels()
@@ -496,8 +496,8 @@ class Learner:
         """Complete the candidate's report; hand report and model to the thread that stores them.
 
         The candidate is a trained version that is not in force yet. Returns a future of the
-        version's number: the report's, or a higher one if another cell of the product stored a
-        version first. Without a model only the report is stored, and the number is the report's.
+        version's number: the report's, or a higher one if another robot cell of the product stored
+        a version first. Without a model only the report is stored, and the number is the report's.
         Raises StoreError if the store is unavailable. With a store in memory the future is done.
         """
         report = candidate.complete_report(self.live.next_version)
@@ -559,10 +559,10 @@ class Learner:
     def _try_to_hear(self, peers: Peers, with_labels: bool = True) -> bool:
         """Take in what peers stored (`_hear_of_peers`); return whether the store gave an answer.
 
-        These are versions and corrections of the product's other cells, and the labels of all cells
-        if there is such news or with `with_labels`. If the store gave no answer, or this cell's
-        labels could not be stored, the result is False; this is logged, once until it answers
-        again, and nothing is raised.
+        These are versions and corrections of the product's other robot cells, and the labels of all
+        cells if there is such news or with `with_labels`. If the store gave no answer, or this
+        cell's labels could not be stored, the result is False; this is logged, once until it
+        answers again, and nothing is raised.
         """
         failure = None
         try:
@@ -573,7 +573,7 @@ class Learner:
         return failure is None
 
     def _hear_of_peers(self, with_labels: bool = True) -> None:
-        """Put a newer version and corrections of the product's other cells in force.
+        """Put a newer version and corrections of the product's other robot cells in force.
 
         If there is a newer version or correction, or with `with_labels`, this cell's labels are
         stored first, and the labels of all cells are read into the training window at the end. What
@@ -609,7 +609,7 @@ class Learner:
         """Finish what is under way before a person's change: a training, labels, news of peers.
 
         A trained version is put in force or dropped, and a training that is not done is discarded
-        and begins again later (`end_training`). News is what the product's other cells stored
+        and begins again later (`end_training`). News is what the product's other robot cells stored
         (`_hear_of_peers`). A trained version that cannot be stored is dropped. Raises StoreError if
         the store is unavailable.
         """
@@ -621,14 +621,14 @@ class Learner:
         """Apply the store's newest corrections to window, references, count of new labels and rule.
 
         If the model cannot change a reference and `may_retrain` is True, it is retrained in this
-        thread, or, if it is pinned, fitted again as a new version; only the cell that corrected
-        does so, and no training may be under way then (`end_training`). If the next training does
-        not start from the model in force, because labels were forgotten, its features are computed
-        in advance (`_precompute_other_start`). The store is checked against its ledger (its hash
-        chain); a difference sets the outbox's `integrity_error`, after which every part is
-        verified. A damaged trace is reported by an event in the store. With no new correction the
-        window is read and the rule rebuilt, too; a baseline (a model that the user handed in) is
-        then retrained all the same. Raises StoreError if the store is unavailable, and what
+        thread, or, if it is pinned, fitted again as a new version; only the robot cell that
+        corrected does so, and no training may be under way then (`end_training`). If the next
+        training does not start from the model in force, because labels were forgotten, its features
+        are computed in advance (`_precompute_other_start`). The store is checked against its ledger
+        (its hash chain); a difference sets the outbox's `integrity_error`, after which every part
+        is verified. A damaged trace is reported by an event in the store. With no new correction
+        the window is read and the rule rebuilt, too; a baseline (a model that the user handed in)
+        is then retrained all the same. Raises StoreError if the store is unavailable, and what
         `retrain` raises, or, for a pinned model that is fitted again, `roll_back`.
         """
         self._outbox.check_integrity(0)  # the rule is rebuilt from all of it
@@ -669,8 +669,8 @@ class Learner:
 
         The same model, with its rule, goes on as a new version, of which `take_report` then returns
         a report. It is not checked that a version is pinned. If the new version cannot be stored,
-        also because another cell of the product stored one meanwhile, StoreError is raised and
-        nothing changes.
+        also because another robot cell of the product stored one meanwhile, StoreError is raised
+        and nothing changes.
         """
         live = self.live
         text = f"version {live.version} is pinned no more: the next retrain may replace it"
@@ -699,7 +699,7 @@ class Learner:
 
         Raises StoreError if the version is not kept or is damaged, if a trace is damaged that the
         model must be fitted on again, and if the version cannot be stored, also because another
-        cell of the product stored one meanwhile; and what `restore_model` raises.
+        robot cell of the product stored one meanwhile; and what `restore_model` raises.
         """
         begin = self._clock()
         self._outbox.check_integrity()
@@ -726,10 +726,10 @@ class Learner:
         `policy` the decision rule starts anew and counts the decisions that `evidence` names. With
         None only settings outside the model have changed, and its rule goes on. Before the first
         retrain only the event is stored. A failure to make the model with the new rule ready is
-        logged. Raises SettingError if the rule cannot be made, or the recipe of another cell of the
-        product cannot be read; StoreError if the event cannot be stored, also because another cell
-        of the product stored a version meanwhile; and what the constructor of a user's rule raises,
-        except TypeError. After each of these errors nothing is changed.
+        logged. Raises SettingError if the rule cannot be made, or the recipe of another robot cell
+        of the product cannot be read; StoreError if the event cannot be stored, also because
+        another cell of the product stored a version meanwhile; and what the constructor of a user's
+        rule raises, except TypeError. After each of these errors nothing is changed.
         """
         live = self.live
         template = live.template
@@ -750,8 +750,8 @@ class Learner:
         """Store a model as the next version, with the event of a person's change; put it in force.
 
         `take_report` then returns a report of it, accepted, with `reason` and `seconds`; this
-        empties `dropped`. If the version cannot be stored, also because another cell of the product
-        stored a version meanwhile, StoreError is raised and nothing changes.
+        empties `dropped`. If the version cannot be stored, also because another robot cell of the
+        product stored a version meanwhile, StoreError is raised and nothing changes.
         """
         report = RetrainReport(
             self.live.next_version, seconds, len(trained_on.seq), 0, True, reason

@@ -117,12 +117,12 @@ class LiveModel:
         against the store's ledger; a difference sets the outbox's `integrity_error`, after which
         every part is verified. A damaged trace is reported by an event in the store. Labels that
         came after the version was stored become references, in a product only the labels of this
-        cell, and corrections since then are applied (`add_labels_since`). If the version is from
-        before the present rule, its stored rule is not taken. If the stored rule does not include
-        what it must (`RuleProgress.last_seq`), the rule is rebuilt from all outcomes. An exception
-        as the model is made ready, or as the rule or the references learn, is logged; an exception
-        of the rule also makes it stale, so that every part is verified. `overdue`, `overdue_to` and
-        `corrected_to` are restored, too.
+        robot cell, and corrections since then are applied (`add_labels_since`). If the version is
+        from before the present rule, its stored rule is not taken. If the stored rule does not
+        include what it must (`RuleProgress.last_seq`), the rule is rebuilt from all outcomes. An
+        exception as the model is made ready, or as the rule or the references learn, is logged; an
+        exception of the rule also makes it stale, so that every part is verified. `overdue`,
+        `overdue_to` and `corrected_to` are restored, too.
 
         Parameters
         ----------

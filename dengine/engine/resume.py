@@ -84,9 +84,9 @@ def find_clean_start(
     If `newest`, whose weights learned from the labels that `trained_on` names, saw no such label,
     it is returned. It is also returned if it begins anew with each training, like a baseline, or a
     model that must be fitted again after loading, as its versions lack the fit. Otherwise the
-    newest stored version of the cell or its product that saw no such label is returned, as a new
-    model with the rule of `template`; versions that are damaged or not kept, or whose loading or
-    restoring raises StoreError for another reason, are passed over. If there is none, it is
+    newest stored version of the robot cell or its product that saw no such label is returned, as a
+    new model with the rule of `template`; versions that are damaged or not kept, or whose loading
+    or restoring raises StoreError for another reason, are passed over. If there is none, it is
     `template`, the untrained model with its initial weights.
 
     Returns
@@ -145,14 +145,14 @@ def add_labels_since(
     Let N be the number of the newest label that the version was trained on, or that it got with a
     rollback. The labels are those after N; a baseline (a model that the user handed in) gets those
     after the newest label that it was trained on. Up to number `shared_to` they are those of all
-    cells of the product, and after it only this cell's own. None stands for N, so that an engine
-    that opens a store counts what it counted before. At most the `capacity` newest of the shared
-    labels are read, and as many of the cell's own. Corrections that came since the version was
-    stored are applied between the labels, in the order in which they came, so that the model is the
-    same bit for bit. A correction that the model cannot take (`apply_correction` returns False) is
-    skipped without a message. A baseline, which cannot be corrected, gets the labels as they count
-    now. A label that the model cannot take is logged and skipped; one whose trace is damaged is
-    skipped, and an event is written to the store. Returns the number of the newest correction in
+    robot cells of the product, and after it only this cell's own. None stands for N, so that an
+    engine that opens a store counts what it counted before. At most the `capacity` newest of the
+    shared labels are read, and as many of the cell's own. Corrections that came since the version
+    was stored are applied between the labels, in the order in which they came, so that the model is
+    the same bit for bit. A correction that the model cannot take (`apply_correction` returns False)
+    is skipped without a message. A baseline, which cannot be corrected, gets the labels as they
+    count now. A label that the model cannot take is logged and skipped; one whose trace is damaged
+    is skipped, and an event is written to the store. Returns the number of the newest correction in
     the store. Raises StoreError if the store cannot be read, for a label that is neither 0 nor 1,
     and for traces of different shapes.
     """

@@ -225,7 +225,7 @@ class EngineSettings:
         max_steps, window, audit_rate, stops, label_within and force_limits).
 
         Not compared are the shadow mode, and force limits that the program leaves out, because an
-        operator sets both while the cell runs. Nor is a reducer that is an object, with its
+        operator sets both while the robot cell runs. Nor is a reducer that is an object, with its
         parameters, nor `params` without the name of a reducer. A `trace` is compared only if a
         `TraceSpec` is in force; a rate, units and columns that it leaves out are not compared. A
         recipe that cannot be read, or that names another reducer than the request's, is a
@@ -385,7 +385,8 @@ def check_imports(recipe: Recipe, store: str, allow_import: bool | Collection[st
 
 
 def read_peers_trace_spec(store: "SqlStore") -> TraceSpec | None:
-    """Return the `TraceSpec` of a product's other cells; None if there is none, or no product.
+    """Return the `TraceSpec` of a product's other robot cells; None if there is none, or no
+    product.
 
     It is that of the first cell that has one. Raises StoreError if it is damaged.
     """
@@ -396,9 +397,9 @@ def read_peers_trace_spec(store: "SqlStore") -> TraceSpec | None:
 def agreed_trace_spec(store: "SqlStore", stated: TraceSpec | None) -> TraceSpec | None:
     """Return the `TraceSpec` of a store, completed by a stated one.
 
-    It is the store's own, else that of the product's other cells, else the stated one. A stated one
-    adds rate, units and columns, and only to a `TraceSpec` of its shape. Raises StoreError if a
-    stored one is damaged.
+    It is the store's own, else that of the product's other robot cells, else the stated one. A
+    stated one adds rate, units and columns, and only to a `TraceSpec` of its shape. Raises
+    StoreError if a stored one is damaged.
     """
     agreed = stored_trace_spec(store.settings.read()) or read_peers_trace_spec(store)
     return stated if agreed is None else agreed.completed(stated)
@@ -409,8 +410,8 @@ def fill_from_peers(
 ) -> dict[str, Any]:
     """Return a copy of a new engine's settings, in which a peer's replace some that were not given.
 
-    A peer is another cell of the store's product; the first peer that has settings is taken. Its
-    seed is taken if `request` has none (0 without a peer), and its recipe if `request` names
+    A peer is another robot cell of the store's product; the first peer that has settings is taken.
+    Its seed is taken if `request` has none (0 without a peer), and its recipe if `request` names
     neither reducer, recipe nor model. The recipe is not taken if the peer was given an object, a
     reducer or a model. Nothing is imported. Raises ImportRefusedError if the recipe names a class
     that may not be imported (`check_imports`), SettingError if the recipe cannot be read,
@@ -513,7 +514,7 @@ class SettingsInForce:
 
         A write that is committing gets 2 s more. If the store does not take them, or does not
         answer in time, the error is logged and `is_unsaved` is set, which a later success clears; a
-        commit that was too slow may still happen. Raises SettingError if another cell of the
+        commit that was too slow may still happen. Raises SettingError if another robot cell of the
         product has settings that contradict these, or a recipe of the two cannot be read; then
         nothing is written, and `is_unsaved` stays as it is.
         """

@@ -210,7 +210,7 @@ class Constant(Baseline):
 
 
 class AlwaysVerify(Constant):
-    """Verify every part: the cell without dengine. No error, and nothing saved."""
+    """Verify every part: the robot cell without dengine. No error, and nothing saved."""
 
     title = "always verify"
     lower = 0.0

@@ -57,7 +57,7 @@ def pooled_error(replays: Sequence[Any], side: str = "accepted", alpha: float = 
     The interval is Wilson's, for the number of independent decisions that would have this variance.
     If the variance is 0, for example because no decision or each was wrong, it is Wilson's for the
     number of different traces among these decisions. The interval holds for other parts of the same
-    kind, not for another cell.
+    kind, not for another robot cell.
 
     Parameters
     ----------

@@ -153,7 +153,7 @@ class Contender:
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class Replay:
-    """One run of a cell, recorded or live, of n finished cycles, where n may be 0.
+    """One run of a robot cell, recorded or live, of n finished cycles, where n may be 0.
 
     Attributes
     ----------
@@ -341,7 +341,7 @@ class Replay:
         Parameters
         ----------
         check_seconds : float, default 5.0
-            How long a verification takes in the cell, to compute the time saved.
+            How long a verification takes in the robot cell, to compute the time saved.
 
         Returns
         -------
@@ -408,7 +408,7 @@ class Replay:
 
 
 def observe_cycles(engine: DataEngine, cell: Cell, cycles: int) -> Iterator[ObservedCycle]:
-    """Let the engine drive a cell for a number of cycles, and yield each cycle as it ends.
+    """Let the engine drive a robot cell for a number of cycles, and yield each cycle as it ends.
 
     With the cycle comes the truth: 1.0 if the part was good, 0.0 if it was bad. It is the cell's
     attribute `truth` if it has this attribute (NaN for None), otherwise the label that was
@@ -423,8 +423,8 @@ def observe_cycles(engine: DataEngine, cell: Cell, cycles: int) -> Iterator[Obse
 def to_replay(observed: Sequence[ObservedCycle], recipe: Recipe) -> Replay:
     """Return observed cycles, in their order, as a `Replay`; it is empty if there are none.
 
-    `recipe` is the recipe of the engine that drove the cell. The fields that only a replay of a
-    recorded data set has (`index`, `dataset`, `seed`, `confirm`, `seconds`) keep their defaults.
+    `recipe` is the recipe of the engine that drove the robot cell. The fields that only a replay of
+    a recorded data set has (`index`, `dataset`, `seed`, `confirm`, `seconds`) keep their defaults.
     `name` is the recipe's name, and `retrains` has the reports that the cycles carry.
     """
     cycles = [cycle for cycle, _ in observed]
@@ -471,7 +471,7 @@ def watch(
     cycles: int,
     on_cycle: Callable[[Cycle], None] | None = None,
 ) -> Replay:
-    """Let an engine drive a cell, and return the run as a `Replay`.
+    """Let an engine drive a robot cell, and return the run as a `Replay`.
 
     Parameters
     ----------
@@ -532,8 +532,9 @@ def replay(
     shuffle : bool, default True
         False plays the stream in its recorded order, drift included.
     confirm : bool, default False
-        Whether the cell confirms accepted good parts. By default only line stops are known. With
-        `Policy(stops="all")` the engine takes the absence of a line stop as a confirmation anyway.
+        Whether the robot cell confirms accepted good parts. By default only line stops are known.
+        With `Policy(stops="all")` the engine takes the absence of a line stop as a confirmation
+        anyway.
     on_cycle : callable or None, default None
         Called with the number of finished cycles, for a progress bar.
 

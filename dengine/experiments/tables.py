@@ -182,8 +182,8 @@ def table_of_numbers(
     title, caption : str
         Texts above and below the table.
     rows : sequence of mappings
-        A mapping for each row, at least one: column title -> cell, with the same titles in the same
-        order in all. The first column has the names of the rows.
+        A mapping for each row, at least one: column title -> robot cell, with the same titles in
+        the same order in all. The first column has the names of the rows.
     total : bool, default False
         Draw a line above the last row.
     """

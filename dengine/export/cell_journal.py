@@ -90,7 +90,7 @@ class CellJournal:
 
 
 def read_journal(path: FilePath, spec: TraceSpec) -> CellJournal:
-    """Read and check the journal that the program of an exported model wrote in a cell.
+    """Read and check the journal that the program of an exported model wrote in a robot cell.
 
     Parts without a label are left out unless they were accepted. If the label of an accepted part
     came after the next part was decided, the result has two lines for it: one without a label, and
@@ -237,7 +237,7 @@ def _parse_part(words: list[str], spec: TraceSpec) -> JournalLine:
 
 
 def import_journal(store: "StoreLike", path: FilePath, any_model: bool = False) -> ImportReport:
-    """Import what an exported cell learned into the store of its engine.
+    """Import what an exported robot cell learned into the store of its engine.
 
     A part that was imported before is not imported again, but its label is, if it has none yet; a
     label that contradicts the stored one is only counted. A part whose trace has a fault is

@@ -115,7 +115,7 @@ def find_decision_id(store: SqlStore, part: str) -> str:
     """Return the id of the only decision on a part that is no REJECT, else of its only REJECT.
 
     A rejected part may come again, so REJECT counts only if there is no other decision. Only the
-    newest 20 decisions of this cell on the part are looked at.
+    newest 20 decisions of this robot cell on the part are looked at.
 
     Parameters
     ----------
@@ -163,8 +163,8 @@ def explain(store: SqlStore, decision_id: str, neighbours: int = 10) -> Explanat
     ----------
     store : SqlStore
     decision_id : str
-        Id of the decision; or the number of its part, if this cell has no decision of this id (see
-        `find_decision_id`).
+        Id of the decision; or the number of its part, if this robot cell has no decision of this id
+        (see `find_decision_id`).
     neighbours : int, default 10
         Number of nearest references at most. Those of the decision's own part are left out.
 
@@ -266,9 +266,9 @@ def _find_neighbours(
     same for every reducer. References of the decision's own part (without a number, of a trace
     equal to its trace) are left out. Nothing is yielded if `version` is None, or if the trace of
     the decision was not embedded. A neighbour may lie outside of the radius, which only says what
-    its field `inside` is. If the decision behind a reference is unknown (another cell made it, or
-    its label is damaged), its id, part, source and trace are None. `success` is the label that
-    the version had, without later corrections; `source` is the first report's, without any
+    its field `inside` is. If the decision behind a reference is unknown (another robot cell made
+    it, or its label is damaged), its id, part, source and trace are None. `success` is the label
+    that the version had, without later corrections; `source` is the first report's, without any
     correction. Raises StoreError for a damaged trace.
     """
     embedding = item.decision.embedding  # (K, d)

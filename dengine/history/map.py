@@ -89,9 +89,9 @@ def part_map(store: "SqlStore", recipe: Recipe, version: int) -> PartMap:
     Returns
     -------
     PartMap
-        The known parts are the newest 250 references whose label this cell recorded. Their labels
-        are as the version had them, or as they were reported later; a later correction does not
-        show. There are none if no such version was put in force, if its state is damaged or no
+        The known parts are the newest 250 references whose label this robot cell recorded. Their
+        labels are as the version had them, or as they were reported later; a later correction does
+        not show. There are none if no such version was put in force, if its state is damaged or no
         longer kept, or if it has no references (a model that the user handed in). The newest parts
         come from the cell's newest 10 decisions, of any version: those that this version made and
         whose trace it embedded, with corrected labels. A part that is both appears once, as a

@@ -65,7 +65,7 @@ def load_past_version(
 
     Its references and its rule include this cell's labels that had come by then, as they were
     reported: later corrections are not applied. Of the labels that came after the version was
-    trained, only those that came before the next version of this cell was stored, and at most
+    trained, only those that came before the next version of this robot cell was stored, and at most
     MAX_LABELS (100,000), are read; they become references if this version was in force when they
     came. A damaged label is left out, and an event is written to the store.
 
@@ -243,10 +243,10 @@ def load_rule(store: SqlStore, policy: Policy) -> DecisionRule | None:
     DecisionRule or None
         None if there is no version, or none whose arrays are kept and intact, and if a user's class
         of rule is not imported. Also None if the newest version has no arrays with the names and
-        shapes of the rule's: another cell of the product made it, it is a baseline, it was made
-        under a policy whose rule has other arrays, or the rule was stale (it had missed an update).
-        A rule that learns nothing, like that of "local" with stops="some", has no arrays: another
-        cell's version will do for it, and it is never stale.
+        shapes of the rule's: another robot cell of the product made it, it is a baseline, it was
+        made under a policy whose rule has other arrays, or the rule was stale (it had missed an
+        update). A rule that learns nothing, like that of "local" with stops="some", has no arrays:
+        another cell's version will do for it, and it is never stale.
 
     Raises
     ------

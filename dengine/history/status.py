@@ -218,7 +218,7 @@ class Status:
         Labels that count; labels that were corrected or forgotten.
     certificate : Certificate
     retrains : tuple of StoredVersion
-        Of this cell, oldest first.
+        Of this robot cell, oldest first.
     events : tuple of Event
         The newest, oldest first.
     watch : Watch or None
@@ -450,8 +450,8 @@ def _count_span(tally: Tally, retrains: list[StoredVersion], policy: Policy) -> 
     """Return the counts over a tally's decisions, and over the retrains since the first decision.
 
     Without decisions no retrain counts. A `Tally` holds how many decisions have each combination of
-    properties, like action and reason; `retrains` are all retrains of the cell. The intervals of
-    `would_accept` and `would_reject` (how often the model would have been wrong) are at 95 %,
+    properties, like action and reason; `retrains` are all retrains of the robot cell. The intervals
+    of `would_accept` and `would_reject` (how often the model would have been wrong) are at 95 %,
     whatever the policy's alpha. Their basis is "audits", or "checks" if the policy of now has no
     audit rate, or "" if no outcome is known.
     """
@@ -636,7 +636,7 @@ class Course:
     stretches : list of Stretch
         Counts over consecutive decisions, oldest first.
     retrains : list of StoredVersion
-        Of this cell.
+        Of this robot cell.
     """
 
     stretches: list[Stretch]
@@ -657,9 +657,9 @@ def read_course(store: SqlStore, **by: float) -> Course:
     store : SqlStore
     **by
         `seconds` and `start`, for stretches that are periods of time (`DecisionTable.stretches`);
-        only the newest 120 with decisions are returned. Without them all decisions of the cell are
-        split into at most 120 stretches of equal number, at least 20 each; the newest may have
-        fewer.
+        only the newest 120 with decisions are returned. Without them all decisions of the robot
+        cell are split into at most 120 stretches of equal number, at least 20 each; the newest may
+        have fewer.
 
     Returns
     -------
@@ -732,7 +732,8 @@ def iterate_decisions(
         Decisions read at a time.
     start_after : str or None
         Id of a decision: the iteration starts with the next decision in its direction. For an id
-        that the cell does not have nothing is yielded. None: it starts with the newest or oldest.
+        that the robot cell does not have nothing is yielded. None: it starts with the newest or
+        oldest.
     newest_first : bool, default True
         False: oldest first. Decisions that are made during the iteration are then yielded, too.
 

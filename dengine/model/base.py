@@ -227,7 +227,7 @@ class EngineModel(ABC):
             Hash of the trace's part, or of its content.
         number : int
             Sequence number of the label; negative, and provisional, until a store that several
-            cells share has given one.
+            robot cells share has given one.
         embedding : tuple, shape (K, d), optional
             The trace's embedding by this version, where it was computed for the decision.
         point : array of float32, shape (d,), optional
@@ -243,8 +243,8 @@ class EngineModel(ABC):
     def renumber_reference(self, old: int, new: int) -> None:  # noqa: B027  # a default
         """Replace the provisional number of a reference by the one that the store gave its label.
 
-        Labels have provisional numbers only in a store that several cells share. The default does
-        nothing.
+        Labels have provisional numbers only in a store that several robot cells share. The default
+        does nothing.
         """
 
     def change_reference(self, number: int, hash_: int, y: int | None) -> bool:

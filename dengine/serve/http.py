@@ -323,7 +323,8 @@ class HttpApi:
             bool, Meta(description="Include the state of the safe mode's detectors.")
         ] = False,
     ) -> Json:
-        """Return how the cell is doing: counts of decisions, version, faults, queue and alarm.
+        """Return how the robot cell is doing: counts of decisions, version, faults, queue and
+        alarm.
 
         The counts are of all decisions, and of the newest 500; the alarm is the most urgent thing
         that somebody should look at, empty if there is none. 422: the stored recipe cannot be read;
@@ -401,7 +402,7 @@ class HttpApi:
         shift of this length, and `start` is when one of the shifts begins. Without it all decisions
         are split into at most 120 stretches of at least 20 decisions; the newest stretch may have
         fewer. At most the newest 120 stretches with decisions are returned, but all retrains of the
-        cell. 503: the queue is full, or the store cannot be read.
+        robot cell. 503: the queue is full, or the store cannot be read.
         """
         by = {"seconds": 3600.0 * hours, "start": 3600.0 * start}
         return await self.service.read(lambda store: read_course(store, **by))
@@ -409,18 +410,18 @@ class HttpApi:
     async def embedding(self) -> PartMap:
         """Return where parts lie in the model's embedding, in two dimensions.
 
-        The parts are the newest 250 references with a label of this cell and, of its newest 10
-        decisions, those that the version in force made and for which it embedded the trace. There
-        are none before the first version, and no references if the version's state is not kept.
-        503: the queue is full, or the store cannot be read.
+        The parts are the newest 250 references with a label of this robot cell and, of its newest
+        10 decisions, those that the version in force made and for which it embedded the trace.
+        There are none before the first version, and no references if the version's state is not
+        kept. 503: the queue is full, or the store cannot be read.
         """
         engine = self.service.engine
         return await self.service.read(lambda store: part_map(store, engine.recipe, engine.version))
 
     async def versions(self) -> Json:
-        """Return every retrain of the cell or its product, dropped ones included, oldest first; a
-        version that is kept can be rolled back to. 503: the queue is full, or the store cannot be
-        read.
+        """Return every retrain of the robot cell or its product, dropped ones included, oldest
+        first; a version that is kept can be rolled back to. 503: the queue is full, or the store
+        cannot be read.
         """
         versions = await self.service.read(lambda store: store.versions.all())
         return response_fields("Versions", versions=versions)
@@ -534,7 +535,7 @@ def _read_explanation(store: SqlStore, id_: str) -> Json:
 
     Beside the `Explanation` it has the decision's trace, the corrections of its label, the envelope
     (low, median, high; None without one), and the newest `N_BADS` (10) traces of bad parts among
-    the newest `N_LABELS` (200) labels of cell and product, oldest first (none if their shape
+    the newest `N_LABELS` (200) labels of robot cell and product, oldest first (none if their shape
     is not that of the decision's trace). Raises what `explain` raises, such as StoreError for a
     damaged trace of the decision or of a neighbour, and StoreError if one of these labels is
     neither 0 nor 1 or their traces differ in shape. Other damaged traces are left out, and an event
@@ -564,7 +565,7 @@ def create_app(
     *,
     recorder: RtdeRecorder | None = None,
 ) -> Starlette:
-    """Create the Starlette application that serves a cell.
+    """Create the Starlette application that serves a robot cell.
 
     It serves the operations of `HttpApi`, XML-RPC at POST /RPC2 (`RobotCalls`), and the web page.
     Every request first passes `Guard`. Errors become `Problem`s, and those of an XML-RPC call

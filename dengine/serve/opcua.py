@@ -114,7 +114,7 @@ async def opcua_server(
     cert: Path | None = None,
     key: Path | None = None,
 ) -> AsyncIterator[Server]:
-    """Serve a cell over OPC UA in this event loop, as long as the context lasts.
+    """Serve a robot cell over OPC UA in this event loop, as long as the context lasts.
 
     The logger of asyncua is set to CRITICAL, and stays so.
 
@@ -183,7 +183,7 @@ async def opcua_server(
 
 
 class AddressSpace:
-    """The nodes of one cell in an OPC UA server: its variables, methods and alarm events.
+    """The nodes of one robot cell in an OPC UA server: its variables, methods and alarm events.
 
     `opcua_server` makes it, and calls `build` and then `refresh`, all in the server's event loop.
     Its methods have no recorder, and of the methods of `RobotCalls` only `decide` and `report`.
@@ -202,7 +202,8 @@ class AddressSpace:
         self._alarm = ""
 
     async def build(self) -> None:
-        """Create the nodes of cell.xml in the server: the variables and the methods of the cell.
+        """Create the nodes of robot cell.xml in the server: the variables and the methods of the
+        cell.
 
         It also links the methods Decide and Report to `decide` and `report`, and makes the object
         that sends alarm events. Call it once, before the server starts.
@@ -223,7 +224,7 @@ class AddressSpace:
         self._events.event.SourceName = "Cell"
 
     def _node(self, name: str) -> Node:
-        """Return the node of a variable or a method of the cell, whose NodeId is "Cell.NAME".
+        """Return the node of a variable or a method of the robot cell, whose NodeId is "Cell.NAME".
 
         Whether the server has such a node is not checked. `build` must have been called.
         """

@@ -350,7 +350,7 @@ class RobotCalls:
         return True
 
     async def status(self) -> Struct:
-        """Return how the cell is doing, in plain numbers and texts.
+        """Return how the robot cell is doing, in plain numbers and texts.
 
         It waits in the queue until the engine has written all that it recorded, which may discard
         a training or retrain the model (`CellService.read`). While the store is read no decision

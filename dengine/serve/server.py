@@ -109,7 +109,7 @@ def serve(
     opcua_cert: Path | None,
     opcua_key: Path | None,
 ) -> None:
-    """Serve a cell until SIGTERM, SIGINT, or Ctrl-Break of Windows; it blocks until then.
+    """Serve a robot cell until SIGTERM, SIGINT, or Ctrl-Break of Windows; it blocks until then.
 
     Then the requests under way have `GRACE` (5) seconds to be answered; a SIGINT after another of
     these signals ends without waiting for them. The engine does what is in the queue, and is

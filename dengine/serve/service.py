@@ -222,7 +222,7 @@ class CellService:
             samples, an invalid part number, or an id that belongs to another trace.
         SettingError
             For a first trace that the policy's force limits do not fit, or whose `TraceSpec`
-            contradicts that of another cell of the product.
+            contradicts that of another robot cell of the product.
         ReportError
             For an invalid id.
         StoreError

@@ -36,7 +36,7 @@ class BackupReport:
     Attributes
     ----------
     decisions, labels : int
-        Numbers in the copy, of all cells.
+        Numbers in the copy, of all robot cells.
     from_journals : int
         Number of records (decisions, labels, events) in the journals that the store had not taken
         when they were read.
@@ -69,8 +69,8 @@ def backup_store(url: FilePath, out: FilePath) -> BackupReport:
     Returns
     -------
     BackupReport
-        The numbers of decisions and labels in the copy and of records from journals, and the cells
-        that have no journal beside the store.
+        The numbers of decisions and labels in the copy and of records from journals, and the robot
+        cells that have no journal beside the store.
 
     Raises
     ------
@@ -123,7 +123,7 @@ def backup_store(url: FilePath, out: FilePath) -> BackupReport:
 
 
 def restore_store(copy: FilePath, store: FilePath) -> tuple[CellHistory, ...]:
-    """Copy a backup into a new file `store`, and make a journal beside it for each cell.
+    """Copy a backup into a new file `store`, and make a journal beside it for each robot cell.
 
     The journal names the newest ledger entry that its cell has in `copy`, so that the engine that
     opens the cell next can tell that nothing is missing. A journal that is already beside `store`
@@ -192,8 +192,8 @@ def _add_records(file: Path, cell: str, records: list[Record]) -> None:
 def _fold_wal_and_count(file: Path) -> tuple[int, int]:
     """Turn off SQLite's write-ahead log in a store's file, so that everything is in this one file.
 
-    Return the numbers of its decisions and labels, over all cells. Raise sqlite3.Error if the file
-    cannot be read or written.
+    Return the numbers of its decisions and labels, over all robot cells. Raise sqlite3.Error if the
+    file cannot be read or written.
     """
     with closing(sqlite3.connect(file)) as connection:
         connection.execute("PRAGMA journal_mode = DELETE")

@@ -4,7 +4,7 @@ from .connections import Database
 
 
 class CellTable:
-    """Reads or writes one subject of a store, for one cell.
+    """Reads or writes one subject of a store, for one robot cell.
 
     Parameters
     ----------

@@ -275,7 +275,7 @@ def run_integrity_check(connection: sa.Connection, table: str = "") -> list[str]
 
 
 class Database:
-    """An open database in which one cell reads and writes; one thread writes at a time.
+    """An open database in which one robot cell reads and writes; one thread writes at a time.
 
     Parameters
     ----------
@@ -345,7 +345,8 @@ class Database:
                 self._file = file, file.stat()
 
     def _open(self, product: str | None) -> Scope:
-        """Create the tables or check them, add the cell to them if it is new, set `newest_entry`.
+        """Create the tables or check them, add the robot cell to them if it is new, set
+        `newest_entry`.
 
         Columns that an older store lacks are added. `newest_entry` becomes number and digest of the
         cell's newest entry in its ledger, a hash chain. A new cell gets `product`, and its ledger
@@ -373,10 +374,10 @@ class Database:
         """Context manager that opens a read transaction and gives its connection.
 
         First it calls `before_use`, a function that the outbox has set, which writes the records
-        that wait in it, so that they are seen; if the database of a running cell does not take them
-        in time, they are missing. Raise StoreError if the database fails, is closed or was opened
-        before a fork, and in place of a ValueError, TypeError, OverflowError or OSError that the
-        block raises, unless it is dengine's own.
+        that wait in it, so that they are seen; if the database of a running robot cell does not
+        take them in time, they are missing. Raise StoreError if the database fails, is closed or
+        was opened before a fork, and in place of a ValueError, TypeError, OverflowError or OSError
+        that the block raises, unless it is dengine's own.
         """
         self.check_open()
         self.before_use()
@@ -385,7 +386,8 @@ class Database:
 
     @contextmanager
     def _transaction(self) -> Iterator[sa.Connection]:
-        """Context manager that opens a write transaction, locks the cell and gives the connection.
+        """Context manager that opens a write transaction, locks the robot cell and gives the
+        connection.
 
         After the block an entry for the rows that it added is inserted into the ledger, the cell's
         hash chain, and both are committed. Then `newest_entry` becomes number and digest of this
@@ -458,7 +460,8 @@ class Database:
         return [row.digest.hex() for row in rows] == [digest]
 
     def check_integrity(self, window: int, since: int | None = None) -> str:
-        """Compare the rows that an engine reads with the ledgers (hash chains) of their cells.
+        """Compare the rows that an engine reads with the ledgers (hash chains) of their robot
+        cells.
 
         These are settings, labels, corrections of labels and model versions of this cell and the
         other cells of its product. Of the labels only the newest are checked. The rest is checked
@@ -523,7 +526,8 @@ class Database:
         )
 
     def acquire_lease(self) -> None:
-        """Lock the cell on a PostgreSQL server, and write from now on through that one connection.
+        """Lock the robot cell on a PostgreSQL server, and write from now on through that one
+        connection.
 
         Only one engine has the lock of a cell (the lease). It lasts as long as the connection; if
         that is lost, the next connection locks again, and if another engine has the lock by then,
@@ -545,7 +549,7 @@ class Database:
             raise
 
     def _take_lease(self, connection: Any, record: Any) -> None:
-        """Lock the cell (the lease) for a new PostgreSQL connection, until that is closed.
+        """Lock the robot cell (the lease) for a new PostgreSQL connection, until that is closed.
 
         SQLAlchemy calls this for each new connection, with its own record of the connection, which
         is not used. If another engine has the lock, the connection is closed, and the StoreError
@@ -586,9 +590,9 @@ class Database:
         First `before_use` is called, a function that the outbox has set, so that the records that
         wait in the outbox are written before these rows, if the database takes them in time. The
         call waits until another write transaction of this object has ended, and for the lock of the
-        SQLite file, or of the cell on a server. If rows were added or settings changed, the commit
-        includes a ledger entry for them; then `newest_entry` is set to this entry, and `on_entry`,
-        a function that the outbox has set, is called.
+        SQLite file, or of the robot cell on a server. If rows were added or settings changed, the
+        commit includes a ledger entry for them; then `newest_entry` is set to this entry, and
+        `on_entry`, a function that the outbox has set, is called.
 
         Parameters
         ----------
@@ -647,7 +651,7 @@ class Database:
     def insert(
         self, connection: sa.Connection, column: sa.Column[Any], rows: Sequence[Row]
     ) -> list[int]:
-        """Insert rows of this cell into a table, each with a number; return these numbers.
+        """Insert rows of this robot cell into a table, each with a number; return these numbers.
 
         The first row gets the next free number, and each further row the next one. If a row already
         has a number in `column`, it keeps this number if it is larger than the one that it would
@@ -683,7 +687,8 @@ class Database:
     def rows_by_id(
         self, connection: sa.Connection, query: sa.Select[Any], ids: Sequence[str]
     ) -> dict[str, Any]:
-        """Run a query over decisions for the given ids of this cell, at most CHUNK (500) at a time.
+        """Run a query over decisions for the given ids of this robot cell, at most CHUNK (500) at a
+        time.
 
         `query` selects from the table `decision`, its column `id` included, and is limited to this
         cell here. Return the rows by id; ids without a row are left out. Without ids no query runs.

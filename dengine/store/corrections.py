@@ -56,8 +56,8 @@ class CorrectionTable(CellTable):
         ReportError
             For a decision that is unknown or has no label.
         SettingError
-            If the settings of another cell of the product contradict the new ones, or the recipe of
-            either cannot be read.
+            If the settings of another robot cell of the product contradict the new ones, or the
+            recipe of either cannot be read.
         StoreError
             For data of the event that JSON does not have, for a setting that only the store itself
             may write (`schema.RESERVED`), for an accepted version without arrays, for an array of
@@ -106,7 +106,7 @@ class CorrectionTable(CellTable):
         return labels
 
     def newest_number(self) -> int:
-        """Return the number of the newest correction of the cell or its product; 0: none yet."""
+        """Return the number of the robot cell's or product's newest correction; 0: none yet."""
         with self._database.reading() as connection:
             return self._scope.newest(connection, CORRECTION.c.number)
 
@@ -121,7 +121,7 @@ class CorrectionTable(CellTable):
         Returns
         -------
         list of Correction
-            Of the cell, or of all cells of its product; each with the number of the label, as
+            Of the robot cell, or of all cells of its product; each with the number of the label, as
             `seq`.
 
         Raises
@@ -177,7 +177,7 @@ class CorrectionTable(CellTable):
         return number
 
     def stored_labels(self, connection: sa.Connection, ids: Sequence[str]) -> dict[str, Any]:
-        """Return, by id, a row for each of the given decisions that the cell has stored.
+        """Return, by id, a row for each of the given decisions that the robot cell has stored.
 
         A row has content_hash, quarantined (whether its trace is kept out of training) and time of
         the decision, and of its label success and source as they were reported, its number `seq`,

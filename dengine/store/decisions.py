@@ -27,7 +27,7 @@ from .views import LABELS, DecisionGroup, HistoryFilter, Stretch, Tally
 
 
 class DecisionTable(CellTable):
-    """Reads the decisions of a cell, with their labels after corrections.
+    """Reads the decisions of a robot cell, with their labels after corrections.
 
     It takes what `CellTable` takes. Every method raises StoreError if the database fails; `get`,
     `select`, `pending`, `tally` and `counts` also for a stored value that cannot be read.
@@ -69,7 +69,7 @@ class DecisionTable(CellTable):
         return read_decision(rows[0])
 
     def ids(self) -> Iterator[Sequence[str]]:
-        """Yield the ids of all decisions of the cell, in any order, in lists of at most 500.
+        """Yield the ids of all decisions of the robot cell, in any order, in lists of at most 500.
 
         A read transaction stays open until the last list, or until the iterator is closed. Raise
         StoreError, also between two lists, if the database fails.
@@ -206,11 +206,11 @@ class DecisionTable(CellTable):
     def overdue_to(self, within: int, since_version: int = 0) -> int:
         """Return the number up to which decisions are old enough for their checks to be overdue.
 
-        Decisions are numbered 1, 2, ... in each cell. A check is overdue if its decision has this
-        or a lower number, asked for the check, and has no label. The number returned is the larger
-        of two: the number of the newest decision minus `within`, and the largest `overdue_to` that
-        is stored with a label, which is this number at the time when the rule was updated with the
-        label. It is 0 if nothing can be overdue yet.
+        Decisions are numbered 1, 2, ... in each robot cell. A check is overdue if its decision has
+        this or a lower number, asked for the check, and has no label. The number returned is the
+        larger of two: the number of the newest decision minus `within`, and the largest
+        `overdue_to` that is stored with a label, which is this number at the time when the rule was
+        updated with the label. It is 0 if nothing can be overdue yet.
 
         Parameters
         ----------
@@ -341,7 +341,7 @@ class DecisionTable(CellTable):
         return [Stretch(*row) for row in rows]
 
     def counts(self, tally: Tally | None = None) -> dict[str, Any]:
-        """Return counts of all decisions and labels of the cell.
+        """Return counts of all decisions and labels of the robot cell.
 
         Parameters
         ----------

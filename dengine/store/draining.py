@@ -145,7 +145,7 @@ class Drainer:
         late stop (a line stop of a part that was confirmed as good before) has the number of the
         label that it corrects. There is no pair for a dead letter (a label that the database did
         not take, and that became an event), or for a label that an earlier process left in the
-        journal. Without a product (cells that share labels and versions) the list is empty.
+        journal. Without a product (robot cells that share labels and versions) the list is empty.
         """
         with self._changed:
             numbers = self._label_numbers
@@ -313,10 +313,10 @@ class Drainer:
         event, which is also logged. Then the journal's header notes that the database has the
         records (if it cannot be written, that is ignored), `n_drained` counts them, and they leave
         the queue of the recorder and, except for the newest decisions, the `DecisionIndex`, by
-        which decisions are found in memory. In a product (cells that share labels and versions) the
-        numbers of their labels are kept for `pop_label_numbers`. Raise StoreError if the database
-        fails; nothing of this is done then, and the next call commits the same records again, of
-        which some may be stored already.
+        which decisions are found in memory. In a product (robot cells that share labels and
+        versions) the numbers of their labels are kept for `pop_label_numbers`. Raise StoreError if
+        the database fails; nothing of this is done then, and the next call commits the same records
+        again, of which some may be stored already.
         """
         with self._changed:
             chunk = list(islice(self._recorder.synced, CHUNK))

@@ -22,7 +22,7 @@ from .schema import EVENT
 
 
 class EventTable(CellTable):
-    """Reads and writes the events of a cell.
+    """Reads and writes the events of a robot cell.
 
     It takes what `CellTable` takes.
     """
@@ -61,7 +61,8 @@ class EventTable(CellTable):
         return number
 
     def record_damage(self, text: str) -> None:
-        """Commit an event of kind "damaged" with this text, unless the cell has the same already.
+        """Commit an event of kind "damaged" with this text, unless the robot cell has the same
+        already.
 
         If the store cannot be written, the text is logged instead, and nothing is raised. Raise
         StoreError if it cannot be read.
@@ -76,7 +77,7 @@ class EventTable(CellTable):
                 log.warning("%s (%s)", text, error)
 
     def newest(self, limit: int | None = None) -> list[Event]:
-        """Return the newest events of the cell, oldest first.
+        """Return the newest events of the robot cell, oldest first.
 
         Parameters
         ----------

@@ -31,7 +31,7 @@ from .schema import DECISION, EVENT, LABEL, TRACE
 
 
 class RecordInsertion:
-    """Inserts records into the tables of a cell.
+    """Inserts records into the tables of a robot cell.
 
     Parameters
     ----------
@@ -127,10 +127,10 @@ class RecordInsertion:
     ) -> list[str]:
         """Insert the decisions that are not stored yet, with their traces; nothing is committed.
 
-        Return a text for each decision whose id is stored with other values, in columns or trace.
-        A decision that is stored with the same values is passed over. The stored values are not
-        changed. No two of the decisions may have one id. New ones get the next numbers of the cell,
-        in their order; their attribute `number` is not used.
+        Return a text for each decision whose id is stored with other values, in columns or trace. A
+        decision that is stored with the same values is passed over. The stored values are not
+        changed. No two of the decisions may have one id. New ones get the next numbers of the robot
+        cell, in their order; their attribute `number` is not used.
         """
         trace_columns = TRACE.c["decision_id", "channels", "samples", "data"]
         query = sa.select(*DECISION.c, *trace_columns).select_from(WITH_TRACES)
@@ -159,8 +159,8 @@ class RecordInsertion:
     ) -> None:
         """Insert events, and one "dead letter" for each problem, which is also logged as an error.
 
-        An event is left out if the cell has stored one with the same time, kind and text. A "dead
-        letter" gets the present time and is always inserted. Nothing is committed.
+        An event is left out if the robot cell has stored one with the same time, kind and text. A
+        "dead letter" gets the present time and is always inserted. Nothing is committed.
         """
         new = []
         if events:

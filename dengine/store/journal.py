@@ -553,8 +553,8 @@ def journal_path(url: Any, cell_id: str) -> Path:
     Path
         Beside an SQLite file, links resolved, STORE.CELL.journal. For a server CELL.DIGEST.journal
         in the folder dengine of the user's state folder (`XDG_STATE_HOME`, or ~/.local/state), with
-        the first 60 characters of the escaped cell, and 12 hexadecimal digits of a digest of the
-        server with its port, the database and the cell.
+        the first 60 characters of the escaped robot cell, and 12 hexadecimal digits of a digest of
+        the server with its port, the database and the cell.
     """
     name = urllib.parse.quote(cell_id, safe="")
     if IGNORES_CASE:  # or cell A and cell a would have one journal
@@ -654,13 +654,13 @@ def forked_error(pid: int, name: str) -> StoreError:
 def describe_process() -> str:
     """Return this process's number and host in words, "process N on HOST".
 
-    It is stored, so that another process that finds the cell owned can name its owner.
+    It is stored, so that another process that finds the robot cell owned can name its owner.
     """
     return f"process {os.getpid()} on {socket.gethostname()}"
 
 
 def owned_error(owner: str, name: str) -> StoreError:
-    """Return the StoreError for an engine whose cell another engine owns.
+    """Return the StoreError for an engine whose robot cell another engine owns.
 
     `owner` describes the other engine's process, and `name` what it owns; the message has both.
     """

@@ -38,7 +38,7 @@ CLOSE_SECONDS = 5.0  # the longest that closing waits
 
 
 class JournalledStore(Outbox):
-    """An outbox with a journal between the engine and the database; it owns the cell.
+    """An outbox with a journal between the engine and the database; it owns the robot cell.
 
     Opening copies what an earlier process left in the journal into the database, checks the store's
     integrity, and starts three threads, which `close` ends. Any thread may record and look up.
@@ -373,11 +373,11 @@ class JournalledStore(Outbox):
         """Copy the records to the database, end the threads, close store and journal.
 
         This ends within seconds; but a `patient` outbox first waits without a time limit for the
-        disk and the database, unless they fail. Records that the database does not take stay in
-        the journal, which is logged, and the next engine copies them. Records that the disk does
-        not take are given up, and an error is logged; no call has said that they are on disk. If
-        the disk hangs, store and journal stay open, and the cell is owned until the process ends. A
-        second call does nothing, nor does a call in a forked process.
+        disk and the database, unless they fail. Records that the database does not take stay in the
+        journal, which is logged, and the next engine copies them. Records that the disk does not
+        take are given up, and an error is logged; no call has said that they are on disk. If the
+        disk hangs, store and journal stay open, and the robot cell is owned until the process ends.
+        A second call does nothing, nor does a call in a forked process.
         """
         if not self.is_usable:
             return

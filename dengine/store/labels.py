@@ -56,7 +56,9 @@ class LabelTable(CellTable):
         self._events = events
 
     def newest(self) -> int:
-        """Return the number of the newest label of the cell or its product; 0 before the first."""
+        """Return the number of the newest label of the robot cell or its product; 0 before the
+        first.
+        """
         with self._database.reading() as connection:
             return self._scope.newest(connection, LABEL.c.seq)
 
@@ -87,7 +89,7 @@ class LabelTable(CellTable):
         corrected_to : int or None
             Number of the last correction that is applied, for labels as they stood then; None: all.
         cell_only : bool, default False
-            Leave out the labels of the product's other cells.
+            Leave out the labels of the product's other robot cells.
 
         Returns
         -------
@@ -165,9 +167,10 @@ class LabelTable(CellTable):
 
         Labels of quarantined traces, which no version is trained on, are included, and so are
         forgotten ones. Labels that are not as they were stored are left out. One event with the ids
-        of their decisions, eight at most, is written to the store, unless the cell has the same
-        event already; it is logged if the store cannot be written. A label without its decision is
-        left out, too, without an event. Whether decisions are as they were stored is not checked.
+        of their decisions, eight at most, is written to the store, unless the robot cell has the
+        same event already; it is logged if the store cannot be written. A label without its
+        decision is left out, too, without an event. Whether decisions are as they were stored is
+        not checked.
 
         Parameters
         ----------
@@ -210,9 +213,9 @@ class LabelTable(CellTable):
         Left out are forgotten labels, labels without their decision, labels of quarantined traces
         (stored, but never used in training), and labels of rejected parts (`Source.INSPECTION`),
         because somebody chooses which of these parts come back. Only this cell's labels count:
-        labels of other cells are no evidence for this one, and a drift detector that counts them
-        would notice too late that this cell has changed. Whether labels and decisions are as they
-        were stored is not checked here.
+        labels of other robot cells are no evidence for this one, and a drift detector that counts
+        them would notice too late that this cell has changed. Whether labels and decisions are as
+        they were stored is not checked here.
 
         Parameters
         ----------
@@ -297,7 +300,7 @@ class LabelTable(CellTable):
 
         `damaged` has the ids of their decisions, of which the event names eight and counts the
         others; `part` says what is damaged, "trace" or "label". Nothing is written without ids, or
-        if the cell has the same event already. If the store cannot be written, this is logged
+        if the robot cell has the same event already. If the store cannot be written, this is logged
         instead.
         """
         if damaged:

@@ -155,7 +155,7 @@ def check_key(connection: sa.Connection, cell_id: str, key: bytes, begin: bool =
     key : bytes
         b"" for a ledger without a key.
     begin : bool, default False
-        If the cell has no ledger entry and no key yet, store a setting by which this key is
+        If the robot cell has no ledger entry and no key yet, store a setting by which this key is
         recognized later (a keyed digest, not the key), without a commit; nothing for b"".
 
     Raises
@@ -263,7 +263,7 @@ def parse_object(text: Any) -> dict[str, Any]:
 
 
 class LedgerEntry:
-    """The ledger entry that an open write transaction will end with. The cell must be locked.
+    """The ledger entry that an open write transaction will end with. The robot cell must be locked.
 
     Parameters
     ----------
@@ -350,7 +350,7 @@ class LedgerEntry:
 
 
 def find_integrity_error(connection: sa.Connection, cell_id: str, key: bytes, first: int) -> str:
-    """Compare the rows of a cell that an engine reads with the cell's ledger.
+    """Compare the rows of a robot cell that an engine reads with the cell's ledger.
 
     These are the settings, corrections, versions and newest labels. Of the ledger itself only the
     newest entry is checked. Rows that name a later entry are not read, because another connection

@@ -40,8 +40,8 @@ def open_store(
     ----------
     store : None, str, path or SqlStore
         None: a store in memory. A file or URL: a database; a `CellAddress`, a text that `address`
-        returns, also names the cell and its product (what the cell makes), otherwise the cell is
-        "cell". A file is created if need be, but not its folder. An open store is returned
+        returns, also names the robot cell and its product (what the cell makes), otherwise the cell
+        is "cell". A file is created if need be, but not its folder. An open store is returned
         unchanged.
     must_exist : bool, default False
         Raise a StoreError for a file or cell that does not exist, instead of creating it. Without
@@ -107,9 +107,9 @@ def open_outbox(
 ) -> Outbox:
     """Open the outbox by which an engine records and looks up, in the way that fits its store.
 
-    A `JournalledStore` claims the cell, drains what an earlier process left in the journal, and
-    starts its threads. Either outbox checks the store; what is not as it was written becomes its
-    `integrity_error`, and is not raised. Closing the outbox closes the store, unless that is in
+    A `JournalledStore` claims the robot cell, drains what an earlier process left in the journal,
+    and starts its threads. Either outbox checks the store; what is not as it was written becomes
+    its `integrity_error`, and is not raised. Closing the outbox closes the store, unless that is in
     memory.
 
     Parameters

@@ -404,7 +404,7 @@ class Outbox(ABC):
 
     @abstractmethod
     def close(self) -> None:
-        """Write what can be written within seconds, and let another engine own the cell.
+        """Write what can be written within seconds, and let another engine own the robot cell.
 
         With a journal a second call does nothing, nor does one in a forked process.
         """

@@ -49,7 +49,7 @@ class CellSummary:
 def check_peer_settings(
     settings: Mapping[str, str], peer_settings: Mapping[str, str], name: str, product: str
 ) -> None:
-    """Check that two cells of a product would embed a trace in the same way.
+    """Check that two robot cells of a product would embed a trace in the same way.
 
     The settings on which the arrays of a version depend must be equal: `reducer`, `params`,
     `folds`, `window` and `novelty` of the `Recipe`, the seed, the `TraceSpec`, and the name and
@@ -101,7 +101,7 @@ def _embedding_settings(settings: Mapping[str, str]) -> dict[str, Any]:
 
 
 def check_cell_exists(url: str, cell_id: str) -> None:
-    """Raise a StoreError if a database has no such cell, or cannot be read as a store.
+    """Raise a StoreError if a database has no such robot cell, or cannot be read as a store.
 
     `url` is a file, or a URL of SQLite or PostgreSQL.
     """
@@ -115,7 +115,7 @@ def check_cell_exists(url: str, cell_id: str) -> None:
 
 
 def list_cells(url: str) -> list[CellSummary]:
-    """Return a summary of every cell of a database, sorted by cell_id.
+    """Return a summary of every robot cell of a database, sorted by cell_id.
 
     It has the cell's product, its numbers of decisions and labels, the newest version that was put
     in force in the cell or its product, and the time of the newest decision or label. Forgotten
@@ -131,7 +131,7 @@ def list_cells(url: str) -> list[CellSummary]:
 
 
 def _summarize(connection: sa.Connection, cell: Scope) -> CellSummary:
-    """Return the summary of a cell, as `list_cells` describes it.
+    """Return the summary of a robot cell, as `list_cells` describes it.
 
     `cell` has the cell's id and its product. With a product, `version` is the newest version of all
     its cells.

@@ -31,7 +31,7 @@ from .schema import (
 
 @dataclass(frozen=True)
 class Scope:
-    """A cell and its product, if it has one.
+    """A robot cell and its product, if it has one.
 
     What is learned is shared by a product: labelled traces for training, model versions, and
     corrections. Each is numbered in one sequence over all cells of the product. Decisions and their
@@ -42,13 +42,15 @@ class Scope:
     product: str | None = None
 
     def shared(self, column: sa.Column[Any]) -> sa.ColumnElement[bool]:
-        """Return the SQL condition that a row's cell (`column`) is this one or of its product."""
+        """Return the SQL condition that a row's robot cell (`column`) is this one or of its
+        product.
+        """
         return (
             column == self.cell_id if self.product is None else column.in_(cells_of(self.product))
         )
 
     def cells(self, connection: sa.Connection) -> list[str]:
-        """Return the id of this cell first, then those of its product's other cells, sorted.
+        """Return the id of this robot cell first, then those of its product's other cells, sorted.
 
         Without a product: this cell alone.
         """
@@ -80,7 +82,7 @@ class Scope:
         """Return the number of the next row of a table; nobody else gets it before the commit.
 
         `column` is the table's column of numbers, and `connection` is in a write transaction that
-        has locked the cell. The number is one more than the largest so far. If the cell has a
+        has locked the robot cell. The number is one more than the largest so far. If the cell has a
         product, decisions and events are numbered by cell, all other rows by product, and for these
         this call locks the product. Without a product all rows are numbered by cell.
         """
@@ -94,8 +96,8 @@ class Scope:
     ) -> int:
         """Return the largest number in a column over the cell's rows.
 
-        If the cell has a product, the rows of all cells of the product count. With `conditions`,
-        only over the rows that fulfil them all. 0 if there is none.
+        If the robot cell has a product, the rows of all cells of the product count. With
+        `conditions`, only over the rows that fulfil them all. 0 if there is none.
         """
         query = sa.select(sa.func.max(column)).where(
             column.table.c.cell_id == self.cell_id, *conditions
@@ -107,13 +109,13 @@ class Scope:
     def newest_version(self, connection: sa.Connection) -> int:
         """Return the number of the newest version that was put in force; 0 before the first.
 
-        If the cell has a product, the versions of all cells of the product count.
+        If the robot cell has a product, the versions of all cells of the product count.
         """
         return self.newest(connection, VERSION.c.version, VERSION.c.accepted == sa.true())
 
 
 def cells_of(product: str) -> sa.Select[Any]:
-    """Return the query for the ids of a product's cells, in no order; it is not run."""
+    """Return the query for the ids of a product's robot cells, in no order; it is not run."""
     return sa.select(SETTING.c.cell_id).where(
         SETTING.c.key == PRODUCT_KEY, SETTING.c.value == product
     )
@@ -122,7 +124,8 @@ def cells_of(product: str) -> sa.Select[Any]:
 def newest_of(
     product: str, column: sa.Column[Any], *conditions: sa.ColumnElement[bool]
 ) -> sa.Select[Any]:
-    """Return the query for the largest number in a column over a product's cells; it is not run.
+    """Return the query for the largest number in a column over a product's robot cells; it is not
+    run.
 
     With `conditions`, only over the rows that fulfil them all. The result is NULL if there is none.
     `column` has a table's row numbers. In the table of versions each cell's newest retrain that
@@ -140,7 +143,7 @@ def newest_of(
 
 
 def join_product(connection: sa.Connection, cell_id: str, product: str | None) -> str | None:
-    """Return a cell's product, or None; make a new cell a cell of `product`.
+    """Return a cell's product, or None; make a new robot cell a cell of `product`.
 
     Such a cell gets a new row in the table `setting`, and the product is locked until the
     transaction ends; nothing is committed. Of a cell that has its product already nothing is

@@ -186,7 +186,7 @@ class NewLabel:
         label; None if unknown.
     seq : int
         Number of the label in its cell's journal, 1, 2, ...; the store keeps it. 0 or less: the
-        store gives the next number of the cell, or of its product.
+        store gives the next number of the robot cell, or of its product.
     """
 
     decision_id: str
@@ -229,7 +229,7 @@ class StoredDecision:
     label_time : float or None
         When the label came, in seconds since 1970.
     number : int
-        Number of the decision, 1, 2, ... in each cell; 0 if unknown.
+        Number of the decision, 1, 2, ... in each robot cell; 0 if unknown.
     """
 
     decision: Decision = field(metadata={"flat": True})
@@ -350,7 +350,7 @@ class Event:
     Attributes
     ----------
     number : int
-        1, 2, ... in each cell.
+        1, 2, ... in each robot cell.
     time : float
         In seconds since 1970.
     kind : str
@@ -388,7 +388,7 @@ def open_losses(events: Iterable[Any]) -> list[Any]:
     """Return the events of kind DATA_LOST (records are lost) that no later ACKNOWLEDGED ended.
 
     With one ACKNOWLEDGED a person confirms all losses that came before. `events` are events of a
-    cell, or their rows, oldest first; so is the result.
+    robot cell, or their rows, oldest first; so is the result.
     """
     losses: list[Any] = []
     for event in events:
@@ -434,7 +434,7 @@ class Correction:
     Attributes
     ----------
     number : int
-        1, 2, ... in each cell, or product.
+        1, 2, ... in each robot cell, or product.
     time : float
         In seconds since 1970.
     decision_id : str
@@ -489,7 +489,7 @@ def without_rule(state: Arrays) -> State:
 
 
 class CellAddress(str):
-    """A store's file or URL together with a cell; accepted wherever a store's name is.
+    """A store's file or URL together with a robot cell; accepted wherever a store's name is.
 
     Attributes
     ----------
@@ -502,7 +502,7 @@ class CellAddress(str):
     product: str | None
 
     def __new__(cls, url: str, cell_id: str, product: str | None = None) -> Self:
-        """Return a text equal to `url`, with cell and product as its attributes."""
+        """Return a text equal to `url`, with robot cell and product as its attributes."""
         address = super().__new__(cls, url)
         address.cell_id = cell_id
         address.product = product
@@ -510,7 +510,7 @@ class CellAddress(str):
 
 
 def address(store: FilePath, cell_id: str | None = None, product: str | None = None) -> str:
-    """Return a store's file or URL as text; a `CellAddress` if a cell or product is given.
+    """Return a store's file or URL as text; a `CellAddress` if a robot cell or product is given.
 
     A `CellAddress` is a text with the attributes `cell_id` and `product`. If only a product is
     given, or `cell_id` is "", the cell is named "cell". If neither is given, a `store` that is a
@@ -717,7 +717,7 @@ class StoredVersion:
     Attributes
     ----------
     number : int
-        Number of the retrain: 1, 2, ... in each cell, or product.
+        Number of the retrain: 1, 2, ... in each robot cell, or product.
     time : float
         In seconds since 1970.
     last_seq : int

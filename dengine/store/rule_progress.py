@@ -25,7 +25,7 @@ class RuleProgress:
         Number of the newest label that the rule includes. 0: the rule must be rebuilt from all
         outcomes, since a label was corrected meanwhile, a check is overdue (it counts as wrong
         until its label comes), the stored state is incomplete, or the version was made under an
-        earlier policy or by another cell of the product.
+        earlier policy or by another robot cell of the product.
     overdue_to : int
         Up to this decision number a check without a label is overdue; 0: none is.
     overdue_ids : frozenset of str

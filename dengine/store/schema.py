@@ -138,7 +138,7 @@ LEDGER = sa.Table(  # an entry for every transaction that added rows or changed 
 
 
 def lock(connection: sa.Connection, kind: int, name: str = "") -> None:
-    """Lock the tables (TABLES), or a cell or product by name, until the transaction ends.
+    """Lock the tables (TABLES), or a robot cell or product by name, until the transaction ends.
 
     It waits until another transaction gives the lock up. Numbers are then committed in their order.
     To avoid a deadlock take several locks in the order TABLES, PRODUCT, CELL. With SQLite it does
@@ -153,9 +153,9 @@ def prepare_tables(connection: sa.Connection, cell_id: str, name: str) -> None:
     """Create the tables in an empty database, or check that they are those of a store.
 
     In PostgreSQL the tables of other programs may stand beside them. Columns that later versions of
-    dengine added (`ADDED`) are added to the tables of an older store. A new cell gets a row in the
-    table `setting`, with the version of the schema. The tables are locked until the transaction
-    ends, and nothing is committed.
+    dengine added (`ADDED`) are added to the tables of an older store. A new robot cell gets a row
+    in the table `setting`, with the version of the schema. The tables are locked until the
+    transaction ends, and nothing is committed.
 
     Parameters
     ----------
@@ -186,7 +186,7 @@ def prepare_tables(connection: sa.Connection, cell_id: str, name: str) -> None:
 def read_settings(connection: sa.Connection, cell_id: str) -> dict[str, str]:
     """Return a cell's settings, by key, without those that the store itself keeps (`RESERVED`).
 
-    {} for an unknown cell.
+    {} for an unknown robot cell.
     """
     query = sa.select(SETTING.c.key, SETTING.c.value).where(
         SETTING.c.cell_id == cell_id, SETTING.c.key.not_in(RESERVED)
@@ -195,13 +195,15 @@ def read_settings(connection: sa.Connection, cell_id: str) -> dict[str, str]:
 
 
 def read_setting(connection: sa.Connection, cell_id: str, key: str) -> str | None:
-    """Return a setting of a cell, also one that the store itself keeps; None if there is none."""
+    """Return a setting of a robot cell, also one that the store itself keeps; None if there is
+    none.
+    """
     is_key = (SETTING.c.cell_id == cell_id) & (SETTING.c.key == key)
     return connection.execute(sa.select(SETTING.c.value).where(is_key)).scalar()
 
 
 def insert_settings(connection: sa.Connection, cell_id: str, settings: Mapping[str, str]) -> None:
-    """Insert settings that a cell does not have yet, if any; nothing is committed.
+    """Insert settings that a robot cell does not have yet, if any; nothing is committed.
 
     A setting that the cell has already raises SQLAlchemy's IntegrityError.
     """
@@ -234,9 +236,9 @@ def _add_columns(connection: sa.Connection) -> None:
 def check_schema(connection: sa.Connection, name: str) -> None:
     """Raise a StoreError unless a database holds a store of this schema with all columns.
 
-    The schema has a version, which each cell's settings name; a store without any cell is refused,
-    too. Columns that a later dengine added to the schema (ADDED) may be missing, and others may be
-    there. `name` is the name of the database, for the error.
+    The schema has a version, which each cell's settings name; a store without any robot cell is
+    refused, too. Columns that a later dengine added to the schema (ADDED) may be missing, and
+    others may be there. `name` is the name of the database, for the error.
     """
     is_complete = all(
         {column.name for column in table.c if column not in ADDED}

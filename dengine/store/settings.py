@@ -13,13 +13,13 @@ from .schema import PRODUCT, RESERVED, SETTING, insert_settings, lock, read_sett
 
 
 class SettingTable(CellTable):
-    """Reads and replaces the settings of a cell.
+    """Reads and replaces the settings of a robot cell.
 
     It takes what `CellTable` takes.
     """
 
     def read(self) -> dict[str, str]:
-        """Return the settings that were saved last, by key; {} for a new cell.
+        """Return the settings that were saved last, by key; {} for a new robot cell.
 
         Those that the store itself keeps (`RESERVED`) are left out.
         """
@@ -30,13 +30,14 @@ class SettingTable(CellTable):
         """Commit new settings in the place of all present ones.
 
         The settings that the store itself keeps (`RESERVED`) stay. Raise SettingError if those of
-        another cell of the product contradict them, or a recipe of the two cannot be read, and
-        StoreError for a key in `RESERVED` and if the database fails; then nothing is changed.
+        another robot cell of the product contradict them, or a recipe of the two cannot be read,
+        and StoreError for a key in `RESERVED` and if the database fails; then nothing is changed.
         """
         self._database.write(lambda connection: self.replace(connection, settings))
 
     def replace(self, connection: sa.Connection, settings: Mapping[str, str]) -> None:
-        """Put new settings in the place of all present ones of the cell; nothing is committed.
+        """Put new settings in the place of all present ones of the robot cell; nothing is
+        committed.
 
         `connection` must be in a write transaction. `settings` holds texts by name; a present
         setting that it lacks is deleted. The settings that the store itself keeps (`RESERVED`)
@@ -58,7 +59,7 @@ class SettingTable(CellTable):
         insert_settings(connection, self._database.cell_id, settings)
 
     def of_peers(self) -> dict[str, dict[str, str]]:
-        """Return the settings of the product's other cells, by cell; {} without a product.
+        """Return the settings of the product's other robot cells, by cell; {} without a product.
 
         A cell without settings is left out.
         """
@@ -66,6 +67,6 @@ class SettingTable(CellTable):
             return self._read_peers(connection)
 
     def _read_peers(self, connection: sa.Connection) -> dict[str, dict[str, str]]:
-        """Return the settings of the product's other cells, by cell, of those that have some."""
+        """Return the settings, by cell, of the product's other robot cells that have some."""
         peers = self._scope.cells(connection)[1:]
         return {name: settings for name in peers if (settings := read_settings(connection, name))}

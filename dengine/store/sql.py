@@ -35,7 +35,8 @@ WAIT_VARIABLE = "DENGINE_STORE_WAIT"
 
 
 class SqlStore(AbstractContextManager["SqlStore"]):
-    """An engine's memory in a database: settings, decisions, labels, versions, events of one cell.
+    """An engine's memory in a database: settings, decisions, labels, versions, events of one robot
+    cell.
 
     Parameters
     ----------
@@ -128,7 +129,7 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         self._journal: Journal | None = None
 
     def claim_cell(self) -> Journal:
-        """Claim the cell for this engine, and open its journal; `close` gives both up.
+        """Claim the robot cell for this engine, and open its journal; `close` gives both up.
 
         As long as the cell is claimed, no other engine can own it: the journal's file is locked,
         and on a PostgreSQL server also the cell. A store in memory must not be claimed, which is
@@ -187,7 +188,7 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         """Disconnect from the database; a store in memory stays open.
 
         It waits until another thread has finished writing. Then reads and writes raise StoreError.
-        If an engine claimed the cell, its journal is closed, too, with the records that the
+        If an engine claimed the robot cell, its journal is closed, too, with the records that the
         database lacks, and another engine can own the cell. A second call changes nothing.
         """
         if not self.database.is_in_memory:

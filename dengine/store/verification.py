@@ -92,7 +92,7 @@ class HistoryFault:
 
 @dataclass(frozen=True, slots=True)
 class CellHistory:
-    """The history of one cell.
+    """The history of one robot cell.
 
     Attributes
     ----------
@@ -147,13 +147,13 @@ def verify_history(
     removed, a decision without its trace or a trace or label without its decision, a table that
     cannot be read to its end (the cell's decisions, traces and labels are then not compared), a
     damaged SQLite file, damaged or missing records of a journal, a ledger entry that a cell's
-    journal names and the store lacks, a cell that no engine has opened, lost data that nobody has
-    acknowledged (an event says so), and an `expect` that no entry of the checked cells has. At most
-    20 missing ledger entries of a cell, and 100 findings of SQLite, are returned. A journal that is
-    missing or cannot be read is no fault: `waiting` of the cell is None then. A change of the
-    setting `product`, by which cells share what they learn, is not noticed. The SQLite file of a
-    store that was not in WAL mode is set to it. Takes 40 bytes of memory per row of all cells, the
-    same again for the rows of the cell at hand, and the memory of its ledger entries.
+    journal names and the store lacks, a robot cell that no engine has opened, lost data that nobody
+    has acknowledged (an event says so), and an `expect` that no entry of the checked cells has. At
+    most 20 missing ledger entries of a cell, and 100 findings of SQLite, are returned. A journal
+    that is missing or cannot be read is no fault: `waiting` of the cell is None then. A change of
+    the setting `product`, by which cells share what they learn, is not noticed. The SQLite file of
+    a store that was not in WAL mode is set to it. Takes 40 bytes of memory per row of all cells,
+    the same again for the rows of the cell at hand, and the memory of its ledger entries.
 
     Parameters
     ----------
@@ -242,7 +242,7 @@ def _inspect_journal(path: Path) -> tuple[list[EntryName], int | None, str]:
 
 
 def _selected_cells(connection: sa.Connection, cell_id: str | None) -> list[str]:
-    """Return `cell_id` in a list, or if it is None the ids of all cells in any table, sorted.
+    """Return `cell_id` in a list, or if it is None the ids of all robot cells in any table, sorted.
 
     Raise StoreError for a cell that no table has. A table that cannot be read to its end is left
     out.
@@ -299,7 +299,8 @@ class CellCheck:
         self._is_unreadable = False
 
     def run(self, entries: Sequence[EntryName], loss: str) -> list[HistoryFault]:
-        """Read all rows of the cell, and return what is wrong, table by table; [] if nothing is.
+        """Read all rows of the robot cell, and return what is wrong, table by table; [] if nothing
+        is.
 
         The rows of the tables that the ledger chains come first, then the ledger's entries, the
         settings, events about lost data that nobody has acknowledged, and whether decisions, traces
@@ -339,7 +340,7 @@ class CellCheck:
         return faults
 
     def _fault(self, table: str, key: object, problem: str) -> HistoryFault:
-        """Return a fault of this cell."""
+        """Return a fault of this robot cell."""
         return HistoryFault(self.cell_id, table, str(key), problem)
 
     def _read_raw(self, table: str) -> Iterator[Row]:
@@ -434,7 +435,8 @@ class CellCheck:
         The ledger has a copy of the cell's settings, but not of those that the store itself keeps
         (`RESERVED`), so a change of these is no fault here. A damaged or missing copy counts as
         empty. If the setting with the version of the tables is missing (no engine has opened the
-        cell), that is a fault, too. Raise SQLAlchemy's DatabaseError if a table cannot be read.
+        robot cell), that is a fault, too. Raise SQLAlchemy's DatabaseError if a table cannot be
+        read.
         """
         stored = read_settings(self.connection, self.cell_id)
         is_copy = (LEDGER.c.cell_id == self.cell_id) & LEDGER.c.settings.is_not(None)
@@ -462,9 +464,9 @@ class CellCheck:
     def _check_pairs(self, table: sa.Table, required: sa.Table) -> Iterator[HistoryFault]:
         """Yield a fault for each row of `table` whose decision id is in no row of `required`.
 
-        The fault names the table `required`. If an earlier check of the cell ended with a database
-        error, nothing is read or yielded. Raise SQLAlchemy's DatabaseError if a table cannot be
-        read.
+        The fault names the table `required`. If an earlier check of the robot cell ended with a
+        database error, nothing is read or yielded. Raise SQLAlchemy's DatabaseError if a table
+        cannot be read.
         """
         if self._is_unreadable:  # everything that could not be read would be missing
             return

@@ -72,8 +72,8 @@ class VersionTable(CellTable):
         -------
         int
             The version's number. It is the number in the report, unless `report.accepted` is True
-            and another cell of the product stored a version of this or a larger number meanwhile:
-            then it is the next number.
+            and another robot cell of the product stored a version of this or a larger number
+            meanwhile: then it is the next number.
 
         Raises
         ------
@@ -109,13 +109,13 @@ class VersionTable(CellTable):
     def insert(self, connection: sa.Connection, row: Row) -> int:
         """Insert the row of a retrain; return the number of its version. Nothing is committed.
 
-        The retrain and its version are numbered apart. The retrain gets the next number of the cell
-        or its product; the product is then locked until the transaction ends. `row["version"]` is
-        the number that the caller wants for the version. If the version is not put in force
-        (`accepted` of the row is False), it has that number, and nothing else is done. Otherwise it
-        gets the number after the newest version of cell and product if the number wanted is taken,
-        and the states of older versions of cell and product that `keeps_state` does not keep are
-        deleted.
+        The retrain and its version are numbered apart. The retrain gets the next number of the
+        robot cell or its product; the product is then locked until the transaction ends.
+        `row["version"]` is the number that the caller wants for the version. If the version is not
+        put in force (`accepted` of the row is False), it has that number, and nothing else is done.
+        Otherwise it gets the number after the newest version of cell and product if the number
+        wanted is taken, and the states of older versions of cell and product that `keeps_state`
+        does not keep are deleted.
         """
         number: int = row["version"]
         if row["accepted"]:
@@ -141,13 +141,13 @@ class VersionTable(CellTable):
     def newest_number(self) -> int:
         """Return the number of the newest version that was put in force; 0 before the first.
 
-        Versions of all cells of the product count. Raise StoreError if the database fails.
+        Versions of all robot cells of the product count. Raise StoreError if the database fails.
         """
         with self._database.reading() as connection:
             return self._scope.newest_version(connection)
 
     def newest(self) -> ModelVersion | None:
-        """Return the newest version that was put in force in the cell or its product.
+        """Return the newest version that was put in force in the robot cell or its product.
 
         It comes with its arrays. If they are missing or damaged, an event is written to the store
         (once for each such version), or logged if the store cannot be written, and the next older
@@ -174,7 +174,7 @@ class VersionTable(CellTable):
         return None
 
     def load(self, version: int) -> ModelVersion:
-        """Return a version that was put in force in the cell or its product, with its arrays.
+        """Return a version that was put in force in the robot cell or its product, with its arrays.
 
         Parameters
         ----------
@@ -209,9 +209,9 @@ class VersionTable(CellTable):
     def _load_retrain(self, retrain: int) -> ModelVersion:
         """Return the version that the retrain with this number made, with its arrays.
 
-        There must be such a retrain. A version of another cell is returned without the state of its
-        rule, and its `rule_last_seq` is 0: the rule includes no label. Raise VersionError if the
-        state is missing or damaged.
+        There must be such a retrain. A version of another robot cell is returned without the state
+        of its rule, and its `rule_last_seq` is 0: the rule includes no label. Raise VersionError if
+        the state is missing or damaged.
         """
         query = sa.select(*VERSION.c["cell_id", "version", "last_seq", "state", "state_sum"])
         is_retrain = self._scope.shared(VERSION.c.cell_id) & (VERSION.c.retrain == retrain)
@@ -228,7 +228,7 @@ class VersionTable(CellTable):
         return ModelVersion(row.version, row.last_seq, state)
 
     def all(self, cell_only: bool = False) -> list[StoredVersion]:
-        """Return every retrain of the cell or its product, oldest first.
+        """Return every retrain of the robot cell or its product, oldest first.
 
         Retrains whose version was dropped (not put in force) are included. No arrays are read.
 
@@ -260,14 +260,15 @@ class VersionTable(CellTable):
         ]
 
     def retrains(self) -> list[RetrainReport]:
-        """Return the report of every retrain of the cell or its product, oldest first.
+        """Return the report of every retrain of the robot cell or its product, oldest first.
 
         Raise StoreError as `all` does.
         """
         return [version.report for version in self.all()]
 
     def _accepted_query(self) -> sa.Select[Any]:
-        """Return the query for the versions of the cell or its product that were put in force.
+        """Return the query for the versions of the robot cell or its product that were put in
+        force.
 
         The rows are newest first. The columns are `retrain`, the number among all retrains
         (those that were dropped are numbered, too), `version`, the number of the version, and

@@ -220,8 +220,8 @@ class SimulatedCell:
     seed : int, default 0
         The same seed gives the same insertions, whatever is decided about them.
     cycles : int, default 600
-        Length of the scenario; a change "half way" comes after half of these cycles. The cell can
-        go on after the scenario.
+        Length of the scenario; a change "half way" comes after half of these cycles. The robot cell
+        can go on after the scenario.
 
     Attributes
     ----------
@@ -266,9 +266,9 @@ class SimulatedCell:
         """Pick a part, push it into the fixture, and return the force, float32 of shape (1000,).
 
         The force is in newtons, 2 s at 500 Hz. `last` becomes this insertion, and `clock` goes on
-        by `cycle_s` seconds, a setting of the cell. Raise DengineError if the last part still waits
-        for verify, proceed or reject, or if MuJoCo is not installed, and SettingError, ValueError
-        or OverflowError for settings that cannot be simulated; nothing changes then.
+        by `cycle_s` seconds, a setting of the robot cell. Raise DengineError if the last part still
+        waits for verify, proceed or reject, or if MuJoCo is not installed, and SettingError,
+        ValueError or OverflowError for settings that cannot be simulated; nothing changes then.
         """
         if self._waiting:
             raise DengineError(

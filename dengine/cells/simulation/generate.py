@@ -26,7 +26,7 @@ def simulate(
     progress: Callable[[int], object] = lambda n: None,
     time_step_s: float = TIME_STEP_S,
 ) -> list[SimulatedInsertion]:
-    """Simulate the first n cycles of a cell in parallel processes; return their insertions.
+    """Simulate the first n cycles of a robot cell in parallel processes; return their insertions.
 
     In the scenario "nominal" insertion i depends on (seed, i) alone; in the others also on n.
 

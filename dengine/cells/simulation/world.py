@@ -134,7 +134,7 @@ def _drive(mujoco: Any, model: Any, data: Any, conditions: Conditions, steps: in
 
 
 def cell_xml(c: Conditions, time_step_s: float = TIME_STEP_S) -> str:
-    """Return the MuJoCo model of the whole cell under the conditions `c`, as text in MJCF.
+    """Return the MuJoCo model of the whole robot cell under the conditions `c`, as text in MJCF.
 
     It has the fixture, the carriage, which a drive moves up and down, the elastic wrist with the
     force sensor, and the part, unless the grasp missed it. `time_step_s` is the step of the physics
