@@ -136,9 +136,8 @@ class Dataset:
     def __repr__(self) -> str:
         """Return a short text: name, number and shape of the traces, good ones, and faults."""
         shape = " x ".join(map(str, self.X.shape[1:]))
-        good = int(self.y.sum())
         return (
-            f"<Dataset {self.name}: {len(self)} traces, {shape} samples, {good} good, "
+            f"<Dataset {self.name}: {len(self)} traces, {shape} samples, {int(self.y.sum())} good, "
             f"{len(self.faults)} left out>"
         )
 
@@ -174,8 +173,10 @@ class Dataset:
 
         _, channels, samples = self.cube.shape
         stems = self.channels or (["x"] if channels == 1 else [f"x{c}" for c in range(channels)])
-        names = [f"{stem}_{i}" for stem in stems for i in range(samples)]
-        frame = pd.DataFrame(self.X.reshape(len(self), -1), columns=names)
+        frame = pd.DataFrame(
+            self.X.reshape(len(self), -1),
+            columns=[f"{stem}_{i}" for stem in stems for i in range(samples)],
+        )
         for name, values in (("cause", self.cause), ("part", self.part), ("label", self.y)):
             if values is not None:
                 frame.insert(0, name, values)
@@ -191,8 +192,11 @@ class Dataset:
         name that comes twice is accepted, but `spec` of the result then raises SettingError.
         """
         names = ", ".join(self.channels) or "none, its channels have no names"
-        is_known = set() < {*channels} <= {*self.channels}
-        expect_data(is_known, f"channels of {self.name}, {names}", [*channels])
+        expect_data(
+            set() < {*channels} <= {*self.channels},
+            f"channels of {self.name}, {names}",
+            [*channels],
+        )
         places = [self.channels.index(name) for name in channels]
         X = np.ascontiguousarray(self.cube[:, places])
         return replace(
@@ -218,8 +222,11 @@ class Dataset:
             samples,
             "resampled traces stay whole",
         )
-        fit = "cut" if samples < most and self.fit == "pad" else self.fit
-        return replace(self, X=np.ascontiguousarray(self.X[..., :samples]), fit=fit)
+        return replace(
+            self,
+            X=np.ascontiguousarray(self.X[..., :samples]),
+            fit="cut" if samples < most and self.fit == "pad" else self.fit,
+        )
 
 
 def make_dataset(

@@ -410,7 +410,8 @@ class Description:
         }
         lines = [f"# {name}: {note}" for name, note in notes.items() if name not in table]
         for name, value in table.items():
-            lines += [f"# {notes[name]}"] if name in notes else []
+            if name in notes:
+                lines.append(f"# {notes[name]}")
             lines.append(f"{_toml_key(name)} = {_toml_value(value)}")
         return lines
 

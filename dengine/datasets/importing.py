@@ -187,16 +187,19 @@ def import_labelled(
         description = in_form_of(store, description_of(dataset))
     data = load_dataset(dataset, description)
     with opening(store, wait=LONG_WAIT) as opened:
-        agreed = agreed_trace_spec(opened, data.spec)
         engine = DataEngine.open_or_create(
-            opened, seed, recipe=recipe, trace=agreed, allow_import=allow_import
+            opened,
+            seed,
+            recipe=recipe,
+            trace=agreed_trace_spec(opened, data.spec),
+            allow_import=allow_import,
         )
     try:
         trace_spec = engine.trace or data.spec
         check_agreement(data, trace_spec)
         traces = as_traces(data.X, trace_spec)
         decisions = _verifying_decisions(traces, data)
-        parts = list(zip(decisions, traces, map(as_success, data.y), strict=True))
+        parts = [*zip(decisions, traces, map(as_success, data.y), strict=True)]
         report = import_parts(engine.store, parts, trace_spec, engine.policy, on_traces)
     finally:
         if opened is not store:
@@ -272,8 +275,9 @@ def import_parts(
                 continue
             stored = earlier
             if stored is None:
-                checked = gate(torch.from_numpy(trace), limit)
-                stored = _as_stored(decision, trace, checked, policy, store.clock())
+                stored = _as_stored(
+                    decision, trace, gate(torch.from_numpy(trace), limit), policy, store.clock()
+                )
                 new[id_] = stored
             if counts_unreported and decision.action is Action.ACCEPT:
                 # A decision that was stored without a label was counted as unreported.
@@ -281,9 +285,17 @@ def import_parts(
             if label is not None:
                 n_since = n_unreported * (not stored.quarantined)
                 n_unreported -= n_since
-                source = source_of(decision, label)
-                about = (store.clock(), stored.content_hash, stored.time)
-                labels[id_] = NewLabel(id_, label, source, 0, None, n_since, *about)
+                labels[id_] = NewLabel(
+                    id_,
+                    label,
+                    source_of(decision, label),
+                    0,
+                    None,
+                    n_since,
+                    store.clock(),
+                    stored.content_hash,
+                    stored.time,
+                )
                 counts["quarantined" if stored.quarantined else "imported"] += 1
         store.apply_records([*new.values(), *labels.values()])
         if on_traces is not None:
@@ -303,13 +315,17 @@ def _as_stored(
     seconds since 1970.
     """
     fault, content = checked
-    with_fault = replace(
-        decision,
-        reason=REASONS[fault] if fault else decision.reason,
-        propensity=1.0 if decision.predicted is Action.VERIFY else policy.audited_share,
+    return StoredDecision(
+        replace(
+            decision,
+            reason=REASONS[fault] if fault else decision.reason,
+            propensity=1.0 if decision.predicted is Action.VERIFY else policy.audited_share,
+        ),
+        trace.copy(),
+        trace_hash(content, decision.part),
+        bool(fault),
+        time,
     )
-    hash_ = trace_hash(content, decision.part)
-    return StoredDecision(with_fault, trace.copy(), hash_, bool(fault), time)
 
 
 def _verifying_decisions(traces: TraceArray, data: Dataset) -> Iterator[Decision]:

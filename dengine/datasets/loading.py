@@ -89,11 +89,13 @@ def load_dataset(
     read = own_reader(source) if description is None else None
     if read is not None:
         data = read()
-        data = data.select(names) if names else data
+        if names:
+            data = data.select(names)
     else:
         place = as_source(source)
         about = description_of(place, description)
-        about = about.with_channels(names) if names else about
+        if names:
+            about = about.with_channels(names)
         data = read_recordings(place, about, progress)
     return data if samples is None else data.cut(samples)
 

@@ -128,8 +128,9 @@ class Table:
             cells = np.array([_number(cell, form, pattern) for cell in cells.tolist()])
         values = cells.astype(np.float64)
         groups = f" and groups by {form.thousands!r}" if form.thousands else ""
-        wanted = f"a number with the decimal mark {form.decimal}{groups}"
-        self.refuse(np.abs(values) > LARGEST, wanted, name)
+        self.refuse(
+            np.abs(values) > LARGEST, f"a number with the decimal mark {form.decimal}{groups}", name
+        )
         return values
 
     def refuse(self, is_bad: Cells, wanted: str, name: str) -> None:

@@ -108,8 +108,7 @@ def as_trigger(value: Any) -> Trigger:
     """
     if isinstance(value, Trigger):
         return value
-    form = r"(\w+)(?:=([^@]*))?(?:@(.+))?"
-    match = re.fullmatch(form, str(value).strip())
+    match = re.fullmatch(r"(\w+)(?:=([^@]*))?(?:@(.+))?", str(value).strip())
     kind, number, signal = match.groups(default="") if match else ("", "", "")
     if kind not in KINDS or not re.fullmatch(KINDS[kind][0], number):
         raise SettingError(f"Expected a trigger, as {EXAMPLES}; got {shortened(value)}.")
@@ -164,7 +163,8 @@ class StartFinder:
         False. Its `time` is then one step after the sample before, else the time of this sample.
         """
         if not active:
-            self._off_since = time if self._off_since is None else self._off_since
+            if self._off_since is None:
+                self._off_since = time
             self._last_off = time
             return None
         off_since = self._off_since

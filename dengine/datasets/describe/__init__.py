@@ -17,7 +17,7 @@ import numpy as np
 from ...errors import DataError, listed
 from ..checks import check_forms
 from ..dataset import Fault
-from ..description import UNKNOWN, Clock, Description, flat
+from ..description import UNKNOWN, Clock, Description, Stated, flat
 from ..read.files import as_source, caught, match_files, natural_key, read_file
 from ..read.frames import read_frame
 from ..read.places import without_suffix
@@ -25,7 +25,7 @@ from ..read.split import table_of
 from ..read.text import read_text
 from ..table import Table
 from .bags import propose_bag
-from .columns import Proposal, Stated, Tables
+from .columns import Proposal, Tables
 from .labels import WORD
 from .layout import layout_of, parts_of
 from .roles import propose_roles

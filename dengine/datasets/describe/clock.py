@@ -74,20 +74,21 @@ def propose_clock(p: Proposal) -> None:
     coarse = [c for c in p.unused if c.forms or (NAME.search(c.name) and len({*c.fixed}) > 1)]
     names = [c.name for c in p.unused if c in clocks or (c in coarse and not has_days)]
     if not clocks:
-        has_no_names = "c0" in p.description.text.names or "s" in p.columns  # may be the stroke
         names = [
             c.name for c in p.unused if is_counter(c) or (NAME.search(c.name) and c.usual_step)
         ]
-        names = [*p.columns] if has_no_names else names
+        if "c0" in p.description.text.names or "s" in p.columns:  # no names; s may be the stroke
+            names = [*p.columns]
     if clocks and (is_stated or len(names) == 1):
         p.put("time.column", [column.name for column in clocks])
         p.put("time.format", [form_of(column, p) for column in clocks])
     elif names:
-        text = (
+        p.put(
+            "time.column",
+            UNKNOWN,
             f"of {listed(names)}: one, several that are added (a date, a time, ms), or []: none; "
-            "with time.sort=true if the rows of a part are not in the order of time"
+            "with time.sort=true if the rows of a part are not in the order of time",
         )
-        p.put("time.column", UNKNOWN, text)
 
 
 def is_clock(column: Column) -> bool:
@@ -99,7 +100,7 @@ def is_clock(column: Column) -> bool:
     of another quantity, like N. Numbers count as rising if they fall in at most 10 % of the steps,
     like a counter that begins again, or in at least 90 %, if the newest row is the first.
     """
-    is_named = NAME.search(column.name) is not None
+    is_named = NAME.search(column.name)
     if column.forms or (is_named and column.odd):
         return not column.fixed
     if not is_named or quantity_of(column.unit) or not column.usual_step:
@@ -157,14 +158,16 @@ def form_of(column: Column, p: Proposal) -> str:
     if len(forms) > 1:
         p.notes["time.format"] = f"{listed(forms)}: the cells prove neither"
         return UNKNOWN
-    units = [*forms, column.unit, epoch_of(column)]
+    if forms:
+        return forms[0]
+    units = [column.unit, epoch_of(column)]
     if match := UNIT_IN_NAME.search(column.name):
         units.append(match[1].replace(",", "."))
     elif match := NAMED_UNIT.search(column.name):
         units.append(str(match.lastgroup))
     for unit in units:
         unit = unit.replace("sec", "s")
-        if unit in forms or unit.lstrip("0123456789. ") in UNITS:
+        if unit.lstrip("0123456789. ") in UNITS:
             return unit
     return _unit_by_size(column, p)
 
@@ -178,9 +181,9 @@ def _unit_by_size(column: Column, p: Proposal) -> str:
     """
     step = column.usual_step
     if not step:
-        odd = listed([*column.odd][:3])
         p.notes["time.format"] = (
-            f"no form of times that is known fits {odd}: state it, or text.drop"
+            f"no form of times that is known fits {listed([*column.odd][:3])}: state it, or "
+            "text.drop"
         )
         return UNKNOWN
     if SECONDS[0] <= step <= SECONDS[1]:
@@ -216,21 +219,21 @@ def propose_rate(p: Proposal, tables: Tables) -> None:
     clocks = list[tuple[Table, Floats]]()
     for table in tables:
         with suppress(UnreadableError):
-            clocks.append((table, times_of(table, clock, p.description.text)))
-    if clock.sort:
-        clocks = [(table, np.sort(seconds)) for table, seconds in clocks]
+            seconds = times_of(table, clock, p.description.text)
+            clocks.append((table, np.sort(seconds) if clock.sort else seconds))
     if min((seconds[0] for _, seconds in clocks), default=0.0) > YEARS[0]:
         p.put("order", "time")
     steps = [np.diff(seconds) for _, seconds in clocks]
     means = [s[s >= 0].mean() for s in steps if (s >= 0).any()]
     usual = float(np.median(means or 0.0))
     if not is_rate(usual):
-        text = (
+        p.put(
+            "time.rate_hz",
+            UNKNOWN,
             f"steps of {usual:.6g} s are of no force: is time.format right? If the newest row is "
             "the first, state time.sort=true. A footer is left out with text.drop, the words that "
-            "it begins with"
+            "it begins with",
         )
-        p.put("time.rate_hz", UNKNOWN, text)
         return
     p.put("time.rate_hz", float(f"{1 / usual:.5g}"))
     if p.description.traces.lengths == "resample":
@@ -242,5 +245,8 @@ def propose_rate(p: Proposal, tables: Tables) -> None:
         with caught(faults, table.source):
             check_steps(seconds, p.description.time, table)  # with the rate
     if len(faults) > FEW * len(clocks) + 1:
-        text = f"{len(faults)} of {len(clocks)} recordings have such times: {faults[0]}"
-        p.put("time.gap", UNKNOWN, f"{text}; {ANSWERS}")
+        p.put(
+            "time.gap",
+            UNKNOWN,
+            f"{len(faults)} of {len(clocks)} recordings have such times: {faults[0]}; {ANSWERS}",
+        )

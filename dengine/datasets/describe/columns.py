@@ -12,14 +12,13 @@ from statistics import mode
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...errors import DataError
 from ...records import Floats
-from ..description import Clock, Description, TextForm
+from ..description import Clock, Description, Stated, TextForm
 from ..read.clock import ISO, times_of
 from ..read.split import pattern_of, signals_of, word_columns
-from ..table import Table
+from ..table import Cells, Table
 from ..units import bare, unit_in
 
 DAY = "%Y-%m-%d"
@@ -28,9 +27,10 @@ TIMES = (
     *("%H:%M:%S.%f", "%H:%M:%S", "%H:%M:%S:%f", "%H:%M"),
     *("%I:%M:%S.%f %p", "%I:%M:%S %p"),
 )
-MOMENTS = (f"{day} {time}" for day in DAYS for time in TIMES)
-ZONED = ("%Y-%m-%d %H:%M:%S.%f UTC", "%Y-%m-%d %H:%M:%S.%f")
-FORMS = (DAY, ISO, *DAYS, *TIMES, "%M:%S.%f", *ZONED, *MOMENTS)
+FORMS = (
+    *(DAY, ISO, *DAYS, *TIMES, "%M:%S.%f", "%Y-%m-%d %H:%M:%S.%f UTC", "%Y-%m-%d %H:%M:%S.%f"),
+    *(f"{day} {time}" for day in DAYS for time in TIMES),
+)
 LIKE_A_TIME = re.compile(
     r"\d+[:\-./T](\d+|[A-Za-z]{3})[:\-./T]\d|\d+:\d+\.\d|\d{8}T\d{6}|\d+:\d\d$"
 )
@@ -48,7 +48,6 @@ FORCES = (
     re.compile(r"(?i)force|kraft|fuerza|forza|load|torque|drehmoment|thrust|effort|last\b|力|荷重"),
     re.compile(r"(?i)^(.*\.)?_?(f\b.*|value)$"),
 )
-Stated = Mapping[str, Any]
 Tables = Sequence[Table]
 
 
@@ -73,7 +72,7 @@ class Column:
     form: TextForm
 
     @cached_property
-    def words(self) -> list[NDArray[Any]]:
+    def words(self) -> list[Cells]:
         """The words of each recording, an array of texts each, as `Table.words` gives them.
 
         Raises UnreadableError if cells are lists, and so does every property that needs them.
@@ -165,7 +164,7 @@ class Column:
             with suppress(DataError):
                 times_of(table, Clock((self.name,), (form,)), TextForm())
                 forms.append(form)
-        return forms[:1] if forms[:1] in ([DAY], [ISO]) else forms
+        return forms[:1] if {DAY, ISO} & {*forms} else forms
 
 
 def columns_of(tables: Tables, form: TextForm) -> dict[str, Column]:
@@ -209,7 +208,8 @@ class Proposal:
         """
         if key not in self.stated:
             self.description = self.description.with_values({key: value})
-            self.notes |= {key: note} if note else {}
+            if note:
+                self.notes[key] = note
 
     @property
     def unused(self) -> list[Column]:

@@ -109,8 +109,8 @@ def in_paths(paths: Names) -> list[str]:
     patterns = []
     for pattern in () if any(map(NEGATED.search, stems)) else PATHS:
         words = {m[1] for stem in stems if (m := re.search(f"(?i){pattern}", stem))}
-        used = "|".join(sorted(map(re.escape, words)))
-        patterns += [pattern.replace(WORD, used)] if words else []
+        if words:
+            patterns.append(pattern.replace(WORD, "|".join(sorted(map(re.escape, words)))))
     return patterns
 
 
@@ -146,9 +146,12 @@ def lines_of(p: Proposal) -> list[str]:
     Only the first of `p.tables` is looked at. Comment marks and quotes before it are left out. Each
     beginning comes once; empty ones are left out.
     """
-    above = [line.lstrip("#%* \t\"'") for table in p.tables[:1] for line in table.above]
-    lines = [re.split(r"[;:：=\t,]|  ", line)[0] for line in above]
-    return [*filter(None, dict.fromkeys(line.strip(" \"'") for line in lines))]
+    beginnings = [
+        re.split(r"[;:：=\t,]|  ", line.lstrip("#%* \t\"'"))[0].strip(" \"'")
+        for table in p.tables[:1]
+        for line in table.above
+    ]
+    return [*filter(None, dict.fromkeys(beginnings))]
 
 
 def part_words(source: PartSource, tables: Tables) -> Words:
@@ -239,8 +242,8 @@ def count_sources(p: Proposal, stated: Sequence[LabelSource]) -> dict[LabelSourc
     stated : the source that the user stated, `[label]`; empty if there is none.
     """
     looked_at = {table.source for table in p.tables}
-    others = [Table(name, {}, [], path=name) for name in p.names if name not in looked_at]
-    tables = [*p.tables, *others]
+    tables = [*p.tables]
+    tables += [Table(name, {}, [], path=name) for name in p.names if name not in looked_at]
     parts = part_words(p.description.part, tables)
     counted = dict[LabelSource, Words]()
     for source in stated or sources_of(p, [table.path for table in tables]):
@@ -282,21 +285,19 @@ def propose_label(p: Proposal) -> None:
     }
     known = [source for source in named if UNKNOWN not in meanings[source].values()]
     certain = [source for source in known if UNKNOWN not in source.good + source.bad]
-    doubt = NO_LABEL
     if certain:
         first = meanings[certain[0]]
         n_odd = max(  # recordings that are good by one source and bad by the other
             sum({meaning, others.get(name)} == {0, 1} for name, meaning in first.items())
             for others in meanings.values()
         )
-        is_clear = n_odd == 0
-        doubt = f"two of these disagree on {n_odd:,} of {len(first):,} recordings"
+        doubt = f"two of these disagree on {n_odd:,} of {len(first):,} recordings" if n_odd else ""
     else:
         rivals = {tuple(counted[source].items()) for source in (counted if known else named)}
-        is_clear = len(rivals) == 1
-    if not is_clear:
-        titles = map(title_of, counted, counted.values())
-        p.put("label.column", UNKNOWN, "; ".join([*titles, doubt]))
+        doubt = "" if len(rivals) == 1 else NO_LABEL
+    if doubt:
+        titles = [*map(title_of, counted, counted.values()), doubt]
+        p.put("label.column", UNKNOWN, "; ".join(titles))
         return
     label = (certain or named)[0]
     words = counted[label]
@@ -305,5 +306,8 @@ def propose_label(p: Proposal) -> None:
     place = next(kind for kind in SOURCES if getattr(label, kind))
     note = f"{counts_of(words.values())}, over {len(words):,} recordings"
     p.notes[f"label.{place}"] = note
-    unclear = [key for key in ("good", "bad") if UNKNOWN in getattr(label, key)]
-    p.notes |= {f"label.{key}": f"which words, also one that may come? {note}" for key in unclear}
+    p.notes |= {
+        f"label.{key}": f"which words, also one that may come? {note}"
+        for key in ("good", "bad")
+        if UNKNOWN in getattr(label, key)
+    }

@@ -91,7 +91,7 @@ def may_tell_parts(column: Column) -> bool:
         return False
     if PART_NAME.search(column.name):
         return all(len(words) == len({*words}) for words in column.runs)
-    is_clock = CLOCK_NAME.search(column.name) is not None or bool(column.forms)
+    is_clock = CLOCK_NAME.search(column.name) or column.forms
     return not is_clock and len(column.counts) == column.n_runs
 
 

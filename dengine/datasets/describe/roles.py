@@ -149,11 +149,10 @@ def qualify_rows(p: Proposal) -> None:
             continue
         words = tuple(column.counts)
         if len(words) > 1:
-            text = (
+            p.notes[f"rows.{column.name}.keep"] = (
                 f"which rows are samples? {counts_of(column.counts)}; others drop or invalid; if "
                 "one row has the label, state label.column, and label.at as first or last"
             )
-            p.notes[f"rows.{column.name}.keep"] = text
             words = (UNKNOWN,)
         rows[column.name] = RowWords(words)
     set_rows(p, rows)
@@ -173,7 +172,7 @@ def qualifies(column: Column, n_rows: int) -> bool:
     """
     words = column.counts
     is_named = QUALIFIER_NAME.search(column.name) is not None
-    is_verdict = NAME.fullmatch(column.name) is not None
+    is_verdict = NAME.fullmatch(column.name)
     has_words = any(column.odd) or (is_verdict and column.odd)  # or beside empty cells, a number
     is_coded = is_named and {word.lower() for word in column.odd}.difference(LOST)
     is_full = words.total() in (n_rows, len(column.fixed))  # a cell for each row, or recording
@@ -207,9 +206,11 @@ def propose_part(p: Proposal) -> None:
     qualifies, or several do, nothing is set. A `[part]` that is set already stays. Raises
     SettingError for a malformed `windows.trigger`.
     """
-    least = len(p.tables) / 2
-    named = sources_named(p, PART_NAME, PART_LINE)
-    sources = [s for s in named if len({*part_words(s, p.tables).values()}) > least]
+    sources = [
+        source
+        for source in sources_named(p, PART_NAME, PART_LINE)
+        if len({*part_words(source, p.tables).values()}) > len(p.tables) / 2
+    ]
     if p.description.part == PartSource() and len(sources) == 1:
         p.description = replace(p.description, part=sources[0])
 
@@ -273,8 +274,10 @@ def _other_scales(p: Proposal) -> Iterator[str]:
     for source in sources_named(p, SCALE_NAME, SCALE_NAME):
         words = part_words(source, p.tables).values()
         if len({*words}) > 1:
-            name = source.line or source.column[0]
-            yield f"{name} differs, {counts_of(words)}: convert them first, or state channels"
+            yield (
+                f"{source.line or source.column[0]} differs, {counts_of(words)}: convert them "
+                "first, or state channels"
+            )
 
 
 def may_be_channel(column: Column) -> bool:
@@ -307,13 +310,15 @@ def find_lost(p: Proposal) -> None:
         most = SPARSE * column.counts.total()
         if words and not column.fixed and sum(column.odd.values()) <= most:
             rows[column.name] = RowWords((UNKNOWN,))
-            text = f"numbers, and {counts_of(words)}: state which to drop, or keep=* if none"
-            p.notes[f"rows.{column.name}.keep"] = text
+            p.notes[f"rows.{column.name}.keep"] = (
+                f"numbers, and {counts_of(words)}: state which to drop, or keep=* if none"
+            )
     missing = {*p.description.text.missing}
     strange = dict[str, int]()
     for name in p.description.channels:
-        n_cells = p.columns[name].counts.total()
-        for word, n in p.columns[name].odd.items():
+        column = p.columns[name]
+        n_cells = column.counts.total()
+        for word, n in column.odd.items():
             if not word and p.description.time.column and n > SPARSE * n_cells:
                 rows.setdefault(name, RowWords((ANY,), ("",)))
             elif word.lower() in LOST:
@@ -321,13 +326,16 @@ def find_lost(p: Proposal) -> None:
             elif n > STRANGE * n_cells and word not in missing:
                 strange[word] = n
         if p.description.format == "text":
-            counts = p.columns[name].counts.items()
-            strange |= {word: n for word, n in counts if SENTINEL.fullmatch(word)}
+            strange |= {word: n for word, n in column.counts.items() if SENTINEL.fullmatch(word)}
     set_rows(p, rows)
     p.put("text.missing", sorted(missing))
     if strange:
-        text = f"do these mean a lost sample? {counts_of(strange)}; if so state "
-        p.put("text.missing", UNKNOWN, text + str([*sorted(missing), *strange]))
+        p.put(
+            "text.missing",
+            UNKNOWN,
+            f"do these mean a lost sample? {counts_of(strange)}; if so state "
+            f"{[*sorted(missing), *strange]}",
+        )
 
 
 def propose_lengths(p: Proposal) -> None:
@@ -387,7 +395,7 @@ def propose_order(p: Proposal) -> None:
     if any(match["odd"] for match in matches) or dates != sorted(dates, key=natural_key):
         p.put("order", UNKNOWN, ODD)
     for column in p.unused:
-        is_stamp = column.forms or STAMP_NAME.search(column.name)
-        ranks = [*map(natural_key, column.fixed)] if is_stamp else []
-        if ranks != sorted(ranks):
-            p.put("order", UNKNOWN, f"name, or {column.name}, whose dates have another order")
+        if column.forms or STAMP_NAME.search(column.name):
+            ranks = [*map(natural_key, column.fixed)]
+            if ranks != sorted(ranks):
+                p.put("order", UNKNOWN, f"name, or {column.name}, whose dates have another order")

@@ -17,12 +17,12 @@ import numpy as np
 
 from ...errors import DataError, listed
 from ..dataset import Fault
-from ..description import UNKNOWN, TextForm
+from ..description import UNKNOWN, Stated, TextForm
 from ..read.files import caught, natural_key
 from ..read.text import BLANK, COMMENT, LATIN, header_names, split_line, to_utf8, to_utf8_or_latin
 from ..table import pattern_of
 from ..units import is_unit
-from .columns import LEAST_RUN, MOST_WORDS, NUMBER, Proposal, Stated
+from .columns import LEAST_RUN, MOST_WORDS, NUMBER, Proposal
 
 DELIMITERS = ";\t|, "
 BLANKS_LEAD = 1.15  # by which blanks must be the better delimiter, since cells may hold some
@@ -177,8 +177,10 @@ def _head_lines(rows: Rows, width: int, stated: Stated) -> tuple[int, int]:
         if 2 * n <= len(names) or units:
             is_odd = n or len({*names}) < len(names)
             if is_odd and all(rows[heads[-2] - 1]) and "text.header" not in stated:
-                text = f"lines {heads[-2]} and {i} may be"
-                raise DataError(f"Expected one line of names, {text}; state text.header.")
+                raise DataError(
+                    f"Expected one line of names, lines {heads[-2]} and {i} may be; state "
+                    "text.header."
+                )
             break
         units = heads.pop()
     return max(heads, default=0), units
@@ -298,5 +300,4 @@ def propose_marks(p: Proposal, cells: Collection[str]) -> None:
         p.put("text.thousands", UNKNOWN, f"'.' or ',', or '' if there is none: {n_needed} need it")
     marked = [cell for cell in cells if {*cell}.intersection(".,")]
     if marked and (len({*marks}) > 1 or most < LIKELY * len(cells)):
-        note = f"'.' or ','; {min(marked)} may be a fraction or a thousand"
-        p.put("text.decimal", UNKNOWN, note)
+        p.put("text.decimal", UNKNOWN, f"'.' or ','; {min(marked)} may be a fraction or a thousand")

@@ -110,6 +110,11 @@ def caught(faults: list[Fault], source: str) -> Iterator[None]:
     try:
         yield
     except DataError as error:
-        message = str(error).rstrip(".")
-        line = getattr(error, "line", 0)
-        faults.append(Fault(source, line, message, getattr(error, "column", "")))
+        faults.append(
+            Fault(
+                source,
+                getattr(error, "line", 0),
+                str(error).rstrip("."),
+                getattr(error, "column", ""),
+            )
+        )

@@ -77,8 +77,13 @@ def columns_of(prefix: str, value: Any) -> Columns:
     """
     if isinstance(value, np.ndarray) and value.dtype == object:
         value = value.tolist()
-    message = f"Expected items of one form in {prefix}"
-    with instead(UnreadableError, message, LookupError, TypeError, ValueError):
+    with instead(
+        UnreadableError,
+        f"Expected items of one form in {prefix}",
+        LookupError,
+        TypeError,
+        ValueError,
+    ):
         nested = _turned(value)
     if nested is None:
         return {prefix: as_cells(value if isinstance(value, ITEMS) else [value])}
@@ -107,8 +112,11 @@ def _turned(value: Any) -> Mapping[Any, Any] | None:
     if isinstance(first, Mapping):
         columns = {key: [item[key] for item in value] for key in first}
         n_samples = [len(cells[0]) for cells in columns.values() if isinstance(cells[0], ITEMS)]
-        texts = [cells for cells in columns.values() if {*map(type, cells)} == {str}]
-        names = [cells for cells in texts if len({*cells}) == len(value)]
+        names = [
+            cells
+            for cells in columns.values()
+            if {*map(type, cells)} == {str} and len({*cells}) == len(value)
+        ]
         is_named = names and max(n_samples, default=0) > len(value)
         return dict(zip(names[0], value, strict=True)) if is_named else columns
     if not isinstance(first, ITEMS):

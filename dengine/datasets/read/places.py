@@ -54,7 +54,7 @@ def path_word(path: str, pattern: str) -> str:
     match = expression.search(without_suffix(path))
     if match is None or match[1] is None:
         raise UnreadableError(f"Expected {pattern} in the path, it is not found")
-    return str(match[1])
+    return match[1]
 
 
 def line_word(lines: Sequence[str], beginning: str) -> str:
@@ -74,8 +74,10 @@ def line_word(lines: Sequence[str], beginning: str) -> str:
         found = re.finditer(pattern, "\n".join(lines))
         words = words or {match["word"].rstrip(MARKS) for match in found}
     if len(words) != 1:
-        wanted = f"one word behind {beginning} in the lines above the header"
-        raise UnreadableError(f"Expected {wanted}, got {listed(words) or 'no such line'}")
+        raise UnreadableError(
+            f"Expected one word behind {beginning} in the lines above the header, got "
+            f"{listed(words) or 'no such line'}"
+        )
     return words.pop()
 
 
@@ -195,8 +197,10 @@ class LabelReader:
             )
         words = sorted(self.listing[key])
         if len(words) > 1:
-            message = f"Expected one label for {part or path}, got {listed(words)}"
-            raise UnreadableError(message, column=source.column)
+            raise UnreadableError(
+                f"Expected one label for {part or path}, got {listed(words)}",
+                column=source.column,
+            )
         return words[0]
 
     def label(self, table: Table, part: str) -> int | None:

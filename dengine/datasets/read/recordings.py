@@ -4,7 +4,7 @@ Files are split into one table for each part, each table becomes a `Recording`, 
 a `Dataset`. What does not follow the description becomes a `Fault`.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ from ...errors import DataError, instead, listed
 from ...records import FITS, Floats, TraceArray
 from ...traces import can_fit_length, fit_length
 from ..checks import check_description, without_repeats
-from ..dataset import Dataset, Fault, make_dataset, unit_text
+from ..dataset import Dataset, Fault, Progress, make_dataset, unit_text
 from ..description import ANY, ORDERS, Channel, Description, RowWords, TextForm
 from ..table import Recording, Table, UnreadableError, as_word
 from ..units import bare, conversion, unit_in
@@ -62,12 +62,11 @@ def recording_of(
         If a regular expression or a format of times in the description is invalid.
     """
     clock = description.time
-    form = description.text
     order = description.order
     table = kept_rows(table.whole(), description.rows)
-    seconds = times_of(table, clock, form) if clock.column else None
+    seconds = times_of(table, clock, description.text) if clock.column else None
     rank: Any = ""
-    samples = [samples_of(table, *item, form) for item in description.channels.items()]
+    samples = [samples_of(table, *item, description.text) for item in description.channels.items()]
     lengths = [*map(len, samples if seconds is None else [*samples, seconds])]
     if len({*lengths}) > 1:
         raise UnreadableError(f"Expected channels and times of one length, got {lengths}")
@@ -93,8 +92,14 @@ def recording_of(
         rank = natural_key(without_label(description.label, without_suffix(table.path)))
     elif order not in ORDERS:
         rank = natural_key(table.one_word(order, "first"))
-    trace = fitted(np.stack(samples), seconds, description)
-    return Recording(table.source, trace, label, part, lengths[0], rank)
+    return Recording(
+        table.source,
+        fitted(np.stack(samples), seconds, description),
+        label,
+        part,
+        lengths[0],
+        rank,
+    )
 
 
 @instead(UnreadableError, "Expected columns of one length", IndexError, ValueError)
@@ -110,8 +115,11 @@ def kept_rows(table: Table, rows: Mapping[str, RowWords]) -> Table:
     """
     for column, about in rows.items():
         kinds = np.array(about.kinds(table.words(column)), dtype=np.str_)
-        wanted = f"one of the words {listed(sorted(about.keep + about.drop + about.invalid))}"
-        table.refuse(kinds == "", wanted, column)
+        table.refuse(
+            kinds == "",
+            f"one of the words {listed(sorted(about.keep + about.drop + about.invalid))}",
+            column,
+        )
         if len(kinds) != 1:
             table = table.take(kinds != "drop")
     return table
@@ -163,7 +171,7 @@ def label_of(labels: Sequence[LabelReader], table: Table, part: str) -> int | No
 
 
 def read_recordings(
-    source: Any, description: Description, progress: Callable[[int], None] | None = None
+    source: Any, description: Description, progress: Progress | None = None
 ) -> Dataset:
     """Read the recordings that a description describes.
 
@@ -207,8 +215,10 @@ def read_recordings(
             for part in parts_of(file, description, base):
                 with caught(faults, part.source):
                     recording = recording_of(part, description, labels)
-                    recordings += [recording] if recording else []
-                    n_unlabelled += recording is None
+                    if recording is None:
+                        n_unlabelled += 1
+                    else:
+                        recordings.append(recording)
         if progress is not None:
             progress(1)
     recordings.sort(key=lambda item: item.rank)

@@ -48,8 +48,7 @@ def word_columns(description: Description) -> set[str]:
     `[rows]`. The set also has "" if `[label]` or a `[[check]]` names no column.
     """
     clock = description.time
-    forms = zip(clock.column, clock.format, strict=False)
-    words = {name for name, form in forms if is_dated(form)}
+    words = {name for name, form in zip(clock.column, clock.format, strict=False) if is_dated(form)}
     words.update(description.part.column, description.rows, {description.order} - ORDERS)
     return words.union(source.column for source in description.labels)
 
@@ -143,8 +142,7 @@ def _split_rows(table: Table, description: Description) -> Iterator[Table]:
         if len(breaks) and not description.time.sort:
             message = "Expected the rows of a part together, others stand between them"
             damage.append(UnreadableError(message, table.line(breaks[0]), columns[0]))
-        source = f"{table.source}, {' '.join(key)}"
-        yield replace(table.take(rows), source=source, damage=damage)
+        yield replace(table.take(rows), source=f"{table.source}, {' '.join(key)}", damage=damage)
 
 
 def _split_wide(table: Table, description: Description) -> Iterator[Table]:
@@ -179,10 +177,9 @@ def _split_wide(table: Table, description: Description) -> Iterator[Table]:
         except UnreadableError as error:
             damage = [error]
         columns |= {key: without_empty_end(columns[key]) for key in origin if key in columns}
-        source = f"{table.source}, row {line or i + 1}" if n > 1 else table.source
         yield replace(
             table,
-            source=source,
+            source=f"{table.source}, row {line or i + 1}" if n > 1 else table.source,
             columns=columns,
             lines=[line],
             units=units,

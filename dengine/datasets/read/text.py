@@ -66,8 +66,7 @@ def read_text(
     units = form.units and form.units + above
     end = content.rstrip(b"\n").count(b"\n") + 2
     if first >= end or not content.strip():
-        line = first if content.strip() else 0
-        raise UnreadableError("Expected rows of samples, got none", line)
+        raise UnreadableError("Expected rows of samples, got none", first if content.strip() else 0)
     top = [line.decode() for line in content.split(b"\n", first)[:first]]
     names = _names(top, header, form)
     cells = split_line("".join(top[units - 1 : units]), form.delimiter)
@@ -229,15 +228,18 @@ def _read_strictly(content: bytes, table: Table, form: TextForm) -> Table:
     damage = list[UnreadableError]()
     for i, line in enumerate(content.decode().split("\n"), 1):
         if i >= table.lines[0] and line.strip() and not line.startswith(form.drop):
-            rows[i] = split_line(line, form.delimiter)
-            if len(rows[i]) != n:
-                message = (
-                    f"Expected {n} cells, as there are columns, got {len(rows[i])}; see text.drop"
-                )
+            row = split_line(line, form.delimiter)
+            if len(row) != n:
+                message = f"Expected {n} cells, as there are columns, got {len(row)}; see text.drop"
                 damage.append(UnreadableError(message, i))
-                rows[i] = [""] * n
+                row = [""] * n
+            rows[i] = row
     if damage and len(damage) == len(rows):
         raise damage[0]
     cells = np.array([*rows.values()], dtype=object).reshape(-1, n).T
-    columns = dict(zip(table.columns, cells, strict=True))
-    return replace(table, columns=columns, lines=np.array([*rows]), damage=damage)
+    return replace(
+        table,
+        columns=dict(zip(table.columns, cells, strict=True)),
+        lines=np.array([*rows]),
+        damage=damage,
+    )

@@ -102,14 +102,13 @@ def _listed(table: Table, times: Floats, description: Description, base: Path) -
     encoding that Python does not know.
     """
     about = description.windows
-    form = description.text
     bounds = []
     with in_listing(about.listing):
-        listing = listing_table(base / about.listing, form)
+        listing = listing_table(base / about.listing, description.text)
         keys = listing.words(about.key)
         for column in (about.start, about.end):
             clock = Clock((column,), (about.format,), description.time.zone)
-            bounds.append(times_of(listing, clock, form) - TOLERANCE)
+            bounds.append(times_of(listing, clock, description.text) - TOLERANCE)
     zero = times[0] if bounds[1].max() < EPOCH <= times[0] else 0.0
     begins, ends = np.array(bounds) + zero
     margin = 1.5 / (description.time.rate_hz or np.inf) + TOLERANCE
