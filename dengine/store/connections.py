@@ -535,9 +535,12 @@ class Database:
         database fails; this `Database` can then still be used, without it.
         """
         # The name is shown to an engine that finds the cell locked.
-        options = TIMEOUTS | {"application_name": f"dengine {describe_process()}"[:63]}
         self._writer = sa.create_engine(
-            self.url, pool_pre_ping=True, pool_size=1, max_overflow=0, connect_args=options
+            self.url,
+            pool_pre_ping=True,
+            pool_size=1,
+            max_overflow=0,
+            connect_args=TIMEOUTS | {"application_name": f"dengine {describe_process()}"[:63]},
         )
         chain_writes(self._writer)
         sa.event.listen(self._writer, "connect", self._take_lease)

@@ -172,8 +172,11 @@ class CorrectionTable(CellTable):
             newest = self._scope.next_number(connection, LABEL.c.seq) - 1
             common = {"event": number, "author": event.author, "time": event.time}
             common |= {"success": success, "newest_seq": newest}
-            rows = [common | {"decision_id": id_, "was": was} for id_, was in labels.items()]
-            self._database.insert(connection, CORRECTION.c.number, rows)
+            self._database.insert(
+                connection,
+                CORRECTION.c.number,
+                [common | {"decision_id": id_, "was": was} for id_, was in labels.items()],
+            )
         return number
 
     def stored_labels(self, connection: sa.Connection, ids: Sequence[str]) -> dict[str, Any]:
@@ -184,11 +187,9 @@ class CorrectionTable(CellTable):
         and `corrected`, the label after corrections: 0, 1 or FORGOTTEN (2). These four are None
         without a label. Ids that are not stored are left out.
         """
-        label = (LABEL.c.success, LABEL.c.source, LABEL.c.seq, corrected_label().label("corrected"))
-        return self._database.rows_by_id(
-            connection,
-            sa.select(*DECISION.c["id", "content_hash", "quarantined", "time"], *label).select_from(
-                WITH_LABELS
-            ),
-            ids,
+        query = sa.select(
+            *DECISION.c["id", "content_hash", "quarantined", "time"],
+            *LABEL.c["success", "source", "seq"],
+            corrected_label().label("corrected"),
         )
+        return self._database.rows_by_id(connection, query.select_from(WITH_LABELS), ids)

@@ -129,8 +129,8 @@ class DecisionTable(CellTable):
             conditions.append(DECISION.c.time < where.until)
         number = DECISION.c.number
         if start_after is not None:
-            is_start = self._own(DECISION) & (DECISION.c.id == start_after)
-            start = sa.select(number).where(is_start).correlate(None).scalar_subquery()
+            query = sa.select(number).where(self._own(DECISION), DECISION.c.id == start_after)
+            start = query.correlate(None).scalar_subquery()
             conditions.append(number < start if newest else number > start)
         rows = self._read(
             past_query(self._database.cell_id)
@@ -278,12 +278,12 @@ class DecisionTable(CellTable):
             SOURCE.label("source"),
             sa.func.count().label("n"),
         )
-        times = (
-            sa.func.min(DECISION.c.time).label("first"),
-            sa.func.max(DECISION.c.time).label("last"),
-        )
         query = (
-            sa.select(*group, *times)
+            sa.select(
+                *group,
+                sa.func.min(DECISION.c.time).label("first"),
+                sa.func.max(DECISION.c.time).label("last"),
+            )
             .select_from(WITH_LABELS)
             .group_by(*columns, "aged", SUCCESS, SOURCE)
             .where(self._own(DECISION), DECISION.c.model_version >= since_version)

@@ -132,10 +132,11 @@ class RecordInsertion:
         changed. No two of the decisions may have one id. New ones get the next numbers of the robot
         cell, in their order; their attribute `number` is not used.
         """
-        trace_columns = TRACE.c["decision_id", "channels", "samples", "data"]
-        query = sa.select(*DECISION.c, *trace_columns).select_from(WITH_TRACES)
+        query = sa.select(*DECISION.c, *TRACE.c["decision_id", "channels", "samples", "data"])
         stored = self._database.rows_by_id(
-            connection, query, [item.decision.id for item in decisions]
+            connection,
+            query.select_from(WITH_TRACES),
+            [item.decision.id for item in decisions],
         )
         new = []
         problems = []
@@ -144,9 +145,9 @@ class RecordInsertion:
             if row is None:
                 new.append(item)
             elif different := _differences(item, row):
-                names = ", ".join(different)
                 problems.append(
-                    f"{_describe(item)}, of which the store holds another: {names} differ"
+                    f"{_describe(item)}, of which the store holds another: "
+                    f"{', '.join(different)} differ"
                 )
         self._database.insert(connection, DECISION.c.number, [decision_row(item) for item in new])
         if new:
@@ -164,9 +165,8 @@ class RecordInsertion:
         """
         new = []
         if events:
-            times = [event.time for event in events]
-            query = sa.select(EVENT.c.time, EVENT.c.kind, EVENT.c.text).where(
-                self._database.own(EVENT), EVENT.c.time.in_(times)
+            query = sa.select(*EVENT.c["time", "kind", "text"]).where(
+                self._database.own(EVENT), EVENT.c.time.in_([event.time for event in events])
             )
             stored = {tuple(row) for row in connection.execute(query)}
             new = [event for event in events if (event.time, event.kind, event.text) not in stored]
@@ -180,11 +180,12 @@ class RecordInsertion:
 
         An event "late stop" is inserted with the correction; nothing is committed.
         """
-        text = (
+        event = new_event(
+            "late stop",
             f"decision {as_text(decision_id)} counts as a failure, was a success: its stop came "
-            "after its confirmation"
+            "after its confirmation",
+            self._database.clock(),
         )
-        event = new_event("late stop", text, self._database.clock())
         self._corrections.insert(connection, event, False, {decision_id: True})
 
 
@@ -235,5 +236,7 @@ def _describe(record: Record) -> str:
         return f"an event, {record.text!r}"
     if isinstance(record, StoredDecision):
         return f"a decision, {record.decision.id!r}"
-    label = f"{LABEL_TEXTS[record.success]} from {record.source.value}"
-    return f"a label, {label}, on {record.decision_id!r}"
+    return (
+        f"a label, {LABEL_TEXTS[record.success]} from {record.source.value}, on "
+        f"{record.decision_id!r}"
+    )

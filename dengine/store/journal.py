@@ -104,8 +104,12 @@ def decode_record(blob: bytes) -> Record:
         samples = blob[LENGTH.size + length :]
         kind, row = json.loads(blob[LENGTH.size : LENGTH.size + length])
         if kind == StoredDecision.__name__:
-            trace = unpack(samples).reshape(row["shape"])
-            return from_row(StoredDecision, row, decision=from_row(Decision, row), trace=trace)
+            return from_row(
+                StoredDecision,
+                row,
+                decision=from_row(Decision, row),
+                trace=unpack(samples).reshape(row["shape"]),
+            )
         if kind == NewLabel.__name__:
             return from_row(NewLabel, row, point=unpack(samples) if samples else None)
         return from_row(Event, row)
@@ -477,8 +481,9 @@ class Journal:
                 f"the journal was not as it was written in {damaged} places, which were left out."
             )
         newest = digests[-1].hex() if digests else head.digest
-        n_synced = max(head.n_synced, n_known)
-        self.head = Head(fields["newest"], n_drained, n_synced, newest, head.time)
+        self.head = Head(
+            fields["newest"], n_drained, max(head.n_synced, n_known), newest, head.time
+        )
 
     def _read_record(self, offset: int) -> bytes | None:
         """Return the encoded record at an offset, without what stands before it in the file.

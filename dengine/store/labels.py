@@ -105,9 +105,13 @@ class LabelTable(CellTable):
         """
         scope = Scope(self._database.cell_id) if cell_only else self._scope
         label = corrected_label(corrected_to)
-        columns = (LABEL.c.seq, label.label("success"), LABEL.c.content_hash)
         query = (
-            sa.select(*TRACE.c, *columns, LABEL.c.decision_id.label("labelled_id"))
+            sa.select(
+                *TRACE.c,
+                *LABEL.c["seq", "content_hash"],
+                label.label("success"),
+                LABEL.c.decision_id.label("labelled_id"),
+            )
             .select_from(LABEL.outerjoin(TRACE, TRACE_OF_LABEL))
             .where(scope.shared(LABEL.c.cell_id), TRAINS, label != FORGOTTEN)
             .where(LABEL.c.seq >= int(first))

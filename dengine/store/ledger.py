@@ -416,9 +416,10 @@ def _find_table_error(
     """
     number = IN_FORCE[name]
     table = number.table
+    entry = table.c.entry
     selected = table.c.cell_id == cell_id
-    is_earlier = table.c.entry < sa.func.coalesce(
-        sa.select(table.c.entry)
+    is_earlier = entry < sa.func.coalesce(
+        sa.select(entry)
         .where(selected, number >= first)
         .order_by(number)
         .limit(1)
@@ -426,18 +427,19 @@ def _find_table_error(
         2**62,
     )
     before = connection.execute(
-        sa.select(table.c.entry, number)
+        sa.select(entry, number)
         .where(selected, number < first, is_earlier)
         .order_by(number.desc())
         .limit(1)
     ).first()
     chain = ""
     if before is not None:
-        is_entry = (LEDGER.c.cell_id == cell_id) & (LEDGER.c.number == before.entry)
-        text = connection.execute(sa.select(LEDGER.c.chains).where(is_entry)).scalar()
-        chain = parse_object(text).get(name, "")
+        query = sa.select(LEDGER.c.chains).where(
+            LEDGER.c.cell_id == cell_id, LEDGER.c.number == before.entry
+        )
+        chain = parse_object(connection.execute(query).scalar()).get(name, "")
         selected = selected & (number > before[1])
-    selected &= table.c.entry.is_(None) | (table.c.entry <= last_entry)
+    selected &= entry.is_(None) | (entry <= last_entry)
     rows = connection.execute(
         sa.select(*(column for column in table.c if column.name != "state"))
         .where(selected)

@@ -256,14 +256,14 @@ def past_query(cell_id: str) -> sa.Select[Any]:
     was forgotten), source ("stop" if it was "confirmed" and was corrected to bad), number and time.
     Decisions without a label are included; traces are not. The rows are in no order.
     """
-    labels = (
-        SUCCESS.label("success"),
-        SOURCE.label("source"),
-        LABEL.c.seq.label("label_seq"),
-        LABEL.c.time.label("label_time"),
-    )
     return (
-        sa.select(*DECISION.c, *labels)
+        sa.select(
+            *DECISION.c,
+            SUCCESS.label("success"),
+            SOURCE.label("source"),
+            LABEL.c.seq.label("label_seq"),
+            LABEL.c.time.label("label_time"),
+        )
         .select_from(WITH_LABELS)
         .where(DECISION.c.cell_id == cell_id)
     )
@@ -271,5 +271,9 @@ def past_query(cell_id: str) -> sa.Select[Any]:
 
 def n_decisions(cell_id: str) -> sa.ScalarSelect[int]:
     """Return the scalar subquery for the number of a cell's newest decision, NULL if none."""
-    query = sa.select(sa.func.max(DECISION.c.number)).where(DECISION.c.cell_id == cell_id)
-    return query.correlate(None).scalar_subquery()
+    return (
+        sa.select(sa.func.max(DECISION.c.number))
+        .where(DECISION.c.cell_id == cell_id)
+        .correlate(None)
+        .scalar_subquery()
+    )

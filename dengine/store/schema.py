@@ -62,9 +62,14 @@ def _table(name: str, *parts: Any) -> sa.Table:
     Added are `cell_id`, part of the primary key, the number of the row's ledger entry, and the
     row's sum (`row_sum`).
     """
-    cell = sa.Column("cell_id", sa.String, primary_key=True)
-    entry = sa.Column("entry", sa.BigInteger)
-    return sa.Table(name, METADATA, cell, *parts, entry, sa.Column("sum", sa.LargeBinary))
+    return sa.Table(
+        name,
+        METADATA,
+        sa.Column("cell_id", sa.String, primary_key=True),
+        *parts,
+        sa.Column("entry", sa.BigInteger),
+        sa.Column("sum", sa.LargeBinary),
+    )
 
 
 SETTING = sa.Table(
@@ -198,8 +203,8 @@ def read_setting(connection: sa.Connection, cell_id: str, key: str) -> str | Non
     """Return a setting of a robot cell, also one that the store itself keeps; None if there is
     none.
     """
-    is_key = (SETTING.c.cell_id == cell_id) & (SETTING.c.key == key)
-    return connection.execute(sa.select(SETTING.c.value).where(is_key)).scalar()
+    query = sa.select(SETTING.c.value).where(SETTING.c.cell_id == cell_id, SETTING.c.key == key)
+    return connection.execute(query).scalar()
 
 
 def insert_settings(connection: sa.Connection, cell_id: str, settings: Mapping[str, str]) -> None:

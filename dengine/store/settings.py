@@ -54,8 +54,9 @@ class SettingTable(CellTable):
             lock(connection, PRODUCT, self._scope.product)
             for name, peer_settings in self._read_peers(connection).items():
                 check_peer_settings(settings, peer_settings, name, self._scope.product)
-        is_replaced = self._own(SETTING) & SETTING.c.key.not_in(RESERVED)
-        connection.execute(sa.delete(SETTING).where(is_replaced))
+        connection.execute(
+            sa.delete(SETTING).where(self._own(SETTING), SETTING.c.key.not_in(RESERVED))
+        )
         insert_settings(connection, self._database.cell_id, settings)
 
     def of_peers(self) -> dict[str, dict[str, str]]:

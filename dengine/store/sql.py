@@ -117,15 +117,16 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         )
         self.wait = _checked_wait(wait)
         self.clock = clock
-        self.database = Database(url if url is None else str(url), cell_id, clock, product)
-        self.product = self.database.scope.product
-        self.settings = SettingTable(self.database)
-        self.decisions = DecisionTable(self.database)
-        self.events = EventTable(self.database)
-        self.labels = LabelTable(self.database, self.decisions, self.events)
-        self.versions = VersionTable(self.database, self.events, keep_versions)
-        self.corrections = CorrectionTable(self.database, self.settings, self.versions)
-        self._insertion = RecordInsertion(self.database, self.corrections)
+        database = Database(url if url is None else str(url), cell_id, clock, product)
+        self.database = database
+        self.product = database.scope.product
+        self.settings = SettingTable(database)
+        self.decisions = DecisionTable(database)
+        self.events = EventTable(database)
+        self.labels = LabelTable(database, self.decisions, self.events)
+        self.versions = VersionTable(database, self.events, keep_versions)
+        self.corrections = CorrectionTable(database, self.settings, self.versions)
+        self._insertion = RecordInsertion(database, self.corrections)
         self._journal: Journal | None = None
 
     def claim_cell(self) -> Journal:

@@ -313,24 +313,26 @@ class CellCheck:
         not raised; after one, it is not checked whether decisions, traces and labels belong
         together. If the ledger itself cannot be read, all of `entries` count as lacking.
         """
-        checks = [(table, self._check_rows(table)) for table in CHAINED]
-        checks += [
+        checks = [
+            *((table, self._check_rows(table)) for table in CHAINED),
             (LEDGER.name, self._check_ledger()),
             (SETTING.name, self._check_settings()),
             (EVENT.name, self._check_losses()),
+            *((table.name, self._check_pairs(table, required)) for table, required in REQUIRED),
         ]
-        checks += [(table.name, self._check_pairs(table, required)) for table, required in REQUIRED]
         faults: list[HistoryFault] = []
         for table, check in checks:
             try:
                 faults.extend(check)  # faults before an error stay
             except sa.exc.DatabaseError as error:
                 self._is_unreadable = True
-                problem = f"cannot be read to its end: {error.orig}"
-                faults.append(self._fault(table, "", problem))
+                faults.append(self._fault(table, "", f"cannot be read to its end: {error.orig}"))
         if loss:
-            problem = f"is damaged: {loss} The next engine records that as an alarm"
-            faults.append(self._fault("journal", "", problem))
+            faults.append(
+                self._fault(
+                    "journal", "", f"is damaged: {loss} The next engine records that as an alarm"
+                )
+            )
         faults += [
             self._fault(LEDGER.name, f"entry {number}", CUT_OFF)
             for number, digest in sorted(set(entries))
@@ -439,8 +441,11 @@ class CellCheck:
         read.
         """
         stored = read_settings(self.connection, self.cell_id)
-        is_copy = (LEDGER.c.cell_id == self.cell_id) & LEDGER.c.settings.is_not(None)
-        copies = sa.select(LEDGER.c.settings).where(is_copy).order_by(LEDGER.c.number.desc())
+        copies = (
+            sa.select(LEDGER.c.settings)
+            .where(LEDGER.c.cell_id == self.cell_id, LEDGER.c.settings.is_not(None))
+            .order_by(LEDGER.c.number.desc())
+        )
         # An entry that was changed is found by the chain.
         chained = parse_object(self.connection.execute(copies.limit(1)).scalar())
         for key in sorted(stored.keys() | chained.keys(), key=str):  # a damaged key may be bytes

@@ -132,8 +132,10 @@ class VersionTable(CellTable):
                 if not keeps_state(stored.version, number, self._keep)
             ]
             if dropped:
-                is_dropped = self._scope.shared(VERSION.c.cell_id) & VERSION.c.retrain.in_(dropped)
-                connection.execute(sa.update(VERSION).where(is_dropped).values(state=None))
+                update = sa.update(VERSION).where(
+                    self._scope.shared(VERSION.c.cell_id), VERSION.c.retrain.in_(dropped)
+                )
+                connection.execute(update.values(state=None))
         # Afterwards, so that the new state takes the room of those.
         self._database.insert(connection, VERSION.c.retrain, [row | {"version": number}])
         return number
@@ -213,9 +215,10 @@ class VersionTable(CellTable):
         of its rule, and its `rule_last_seq` is 0: the rule includes no label. Raise VersionError if
         the state is missing or damaged.
         """
-        query = sa.select(*VERSION.c["cell_id", "version", "last_seq", "state", "state_sum"])
-        is_retrain = self._scope.shared(VERSION.c.cell_id) & (VERSION.c.retrain == retrain)
-        row = self._read(query.where(is_retrain))[0]
+        query = sa.select(*VERSION.c["cell_id", "version", "last_seq", "state", "state_sum"]).where(
+            self._scope.shared(VERSION.c.cell_id), VERSION.c.retrain == retrain
+        )
+        row = self._read(query)[0]
         if row.state is None or state_sum(row.state) != row.state_sum:
             raise VersionError(
                 f"Expected the state of version {row.version} as it was stored in "
