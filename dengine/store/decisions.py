@@ -271,16 +271,13 @@ class DecisionTable(CellTable):
             "aged"
         )
         columns = DECISION.c["action", "predicted", "reason", "audit", "quarantined"]
-        group = (
-            *columns,
-            aged,
-            SUCCESS.label("success"),
-            SOURCE.label("source"),
-            sa.func.count().label("n"),
-        )
         query = (
             sa.select(
-                *group,
+                *columns,
+                aged,
+                SUCCESS.label("success"),
+                SOURCE.label("source"),
+                sa.func.count().label("n"),
                 sa.func.min(DECISION.c.time).label("first"),
                 sa.func.max(DECISION.c.time).label("last"),
             )

@@ -116,7 +116,7 @@ class RecordInsertion:
         ]
         numbers = {id_: row.seq for id_, row in stored.items()}
         new_numbers = self._database.insert(connection, LABEL.c.seq, rows)
-        numbers |= dict(zip(new, new_numbers, strict=True))
+        numbers |= zip(new, new_numbers, strict=True)
         self._insert_events(connection, events, problems)
         for id_ in late_stops:
             self._correct_confirmation(connection, id_)

@@ -243,19 +243,18 @@ class LabelTable(CellTable):
             Bounds of the decision, label, what the model alone would have done, and so on.
         """
         label = corrected_label()
-        novel = DECISION.c.reason == Reason.NOVEL.value
-        fields = (
-            LABEL.c.seq,
-            *DECISION.c["lower", "upper"],
-            label == 1,
-            novel,
-            LABEL.c.silent,
-            *audit_columns(),
-        )
         # A label that does not know came right after its decision, as most do.
         known_overdue = sa.func.coalesce(LABEL.c.overdue_to, DECISION.c.number)
         rows = self._read(
-            sa.select(*fields, known_overdue)
+            sa.select(
+                LABEL.c.seq,
+                *DECISION.c["lower", "upper"],
+                label == 1,
+                DECISION.c.reason == Reason.NOVEL.value,
+                LABEL.c.silent,
+                *audit_columns(),
+                known_overdue,
+            )
             .select_from(LABEL.join(DECISION, LABEL_OF_DECISION))
             .where(
                 self._own(LABEL),

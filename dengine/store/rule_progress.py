@@ -88,6 +88,6 @@ def read_rule_progress(
     last_seq = int(state.get("rule_last_seq", version.last_seq))
     is_incomplete = not state.keys().isdisjoint(("rule_is_stale", "includes_overdue"))
     is_earlier = version.version < since_version
-    is_corrected = bool(store.corrections.after(int(state.get("corrected_to", 0))))
-    must_rebuild = bool(overdue_ids) or is_incomplete or is_earlier or is_corrected
+    corrections = store.corrections.after(int(state.get("corrected_to", 0)))
+    must_rebuild = overdue_ids or is_incomplete or is_earlier or corrections
     return RuleProgress(0 if must_rebuild else last_seq, overdue_to, overdue_ids)
