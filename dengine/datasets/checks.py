@@ -91,14 +91,13 @@ def without_repeats(recordings: Sequence[Recording]) -> tuple[list[Recording], l
         groups[hash_].append(recording)
     kept: list[Recording] = []
     faults: list[Fault] = []
-    for first, *repeats in groups.values():
-        message = f"Expected other samples than those of {first.source}, it repeats them"
-        if all(item.label == first.label for item in repeats):
-            kept.append(first)
-        else:
-            message = f"Expected one label for the samples of {first.source}, got two"
-            repeats = [first, *repeats]
-        faults += [Fault(item.source, 0, message) for item in repeats]
+    for group in groups.values():
+        source = group[0].source
+        message = f"Expected one label for the samples of {source}, got two"
+        if len({item.label for item in group}) == 1:
+            message = f"Expected other samples than those of {source}, it repeats them"
+            kept.append(group.pop(0))
+        faults += [Fault(item.source, 0, message) for item in group]
     return kept, faults
 
 

@@ -54,7 +54,7 @@ def propose_bag(p: Proposal) -> None:
             if hasattr(message, "data"):
                 words[topic].append(str(message.data))
             elif len(times[topic]) == 1:
-                units |= dict(_fields(message, topic))
+                units |= _fields(message, topic)
                 is_stamped &= hasattr(message, "header") and message.header.stamp.sec > 0
     except UnreadableError:  # the messages before the damage are enough
         if not times:
