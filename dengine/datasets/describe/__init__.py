@@ -9,7 +9,6 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from statistics import mode
 from typing import Any
 
 import numpy as np
@@ -25,7 +24,7 @@ from ..read.split import table_of
 from ..read.text import read_text
 from ..table import Table
 from .bags import propose_bag
-from .columns import Proposal, Tables
+from .columns import Proposal, Tables, most_frequent
 from .labels import WORD
 from .layout import layout_of, parts_of
 from .roles import propose_roles
@@ -220,8 +219,12 @@ def read_tables(p: Proposal) -> list[Table]:
             files.append(table_in(p, contents[name], name))
     if not files:
         raise DataError(f"Expected a table of samples, found none: {faults[0]}.")
-    usual = mode(tuple(table.columns) for table in files)
-    return [table for table in files if tuple(table.columns) == usual]
+    usual = most_frequent([((*t.columns,), sum(map(len, t.columns.values()))) for t in files])
+    if p.description.format == "parquet":  # a smaller table may be a listing
+        odd = [table.source for table in files if (*table.columns,) != usual]
+        p.others = [*p.others, *odd]
+        p.names = [name for name in p.names if name not in odd]
+    return [table for table in files if (*table.columns,) == usual]
 
 
 def table_in(p: Proposal, content: bytes, name: str) -> Table:

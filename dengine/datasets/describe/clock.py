@@ -3,6 +3,7 @@
 import math
 import re
 from contextlib import suppress
+from itertools import pairwise
 
 import numpy as np
 
@@ -20,13 +21,14 @@ from .columns import FORCES, Column, Proposal, Tables
 NAME = re.compile(
     r"time|zeit|stamp|clock|temps|tiempo|tempo|hora|heure|millis|milli?tm|micros|elapsed|epoch"
     r"|(^|\.)(t|ms|us|ns|sec|secs|seconds|date|datum|uhr|x_value)$|^t[ _/\[(]|tick_?count"
-    r"|^tm$|(^|[._ ])([mun]sec|tick|(\w+_)?ts)s?($|[._ ])|(?<![a-z])[\[(][mun\u00b5]?s(ec)?[\])]"
+    r"|^tm$|(^|[._ ])([mun]sec|tick|(\w+_)?ts)s?($|[._ ])"
+    r"|((?<![a-z])[\[(]|[\[(][mun\u00b5])s(ec)?[\])]"
     r"|tijd|czas|时间|時間|時刻|시간",
     re.IGNORECASE,
 )
 COUNTER_NAME = re.compile(r"(?i)(index|row|sample|n|i|punkt|point|count|nr|no|line)s?")
 UNIT_IN_NAME = re.compile(
-    r"(?:[\[(/_ ]|in )\s*((?:[\d.,]+ ?)?(?:s|ms|us|µs|ns|min|h|[mun]?sec))\s*[\])]?$"
+    r"(?:[\[(/_ ]|\.\.|in )\s*((?:[\d.,]+ ?)?(?:s|ms|us|µs|ns|min|h|[mun]?sec))\s*[\])_.]?$"
 )
 # Names that are a unit. Whole seconds and nanoseconds may stand in two columns beside each other.
 NAMED_UNIT = re.compile(
@@ -221,8 +223,13 @@ def propose_rate(p: Proposal, tables: Tables) -> None:
         with suppress(UnreadableError):
             seconds = times_of(table, clock, p.description.text)
             clocks.append((table, np.sort(seconds) if clock.sort else seconds))
-    if min((seconds[0] for _, seconds in clocks), default=0.0) > YEARS[0]:
+    spans = [(seconds[0], seconds[-1]) for _, seconds in clocks]
+    ordered = sorted(spans)
+    if min(spans, default=(0.0,))[0] > YEARS[0]:
         p.put("order", "time")
+    elif spans != ordered and all(a[1] < b[0] for a, b in pairwise(ordered)):
+        text = "time, or name: one clock runs on through all recordings, and has another order"
+        p.put("order", UNKNOWN, text)
     steps = [np.diff(seconds) for _, seconds in clocks]
     means = [s[s >= 0].mean() for s in steps if (s >= 0).any()]
     usual = float(np.median(means or 0.0))

@@ -164,7 +164,17 @@ class Column:
             with suppress(DataError):
                 times_of(table, Clock((self.name,), (form,)), TextForm())
                 forms.append(form)
+        # Of two forms that fit, cells without a fraction have the one without it.
+        forms = [form for form in forms if form.replace(".%f", "") not in {*forms} - {form}]
         return forms[:1] if {DAY, ISO} & {*forms} else forms
+
+
+def most_frequent(items: Sequence[tuple[Any, int]]) -> Any:
+    """Return the most frequent of the first elements; of equally frequent ones that with the
+    largest size, the second element.
+    """
+    counts = Counter(first for first, _ in items)
+    return max(items, key=lambda item: (counts[item[0]], item[1]))[0]
 
 
 def columns_of(tables: Tables, form: TextForm) -> dict[str, Column]:

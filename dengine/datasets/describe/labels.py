@@ -283,8 +283,8 @@ def propose_label(p: Proposal) -> None:
         source: {name: source.meanings.get(word, UNKNOWN) for name, word in words.items()}
         for source, words in counted.items()
     }
-    known = [source for source in named if UNKNOWN not in meanings[source].values()]
-    certain = [source for source in known if UNKNOWN not in source.good + source.bad]
+    known = [source for source in counted if UNKNOWN not in meanings[source].values()]
+    certain = [s for s in known if s in named and UNKNOWN not in s.good + s.bad]
     if certain:
         first = meanings[certain[0]]
         n_odd = max(  # recordings that are good by one source and bad by the other
@@ -294,7 +294,7 @@ def propose_label(p: Proposal) -> None:
         doubt = f"two of these disagree on {n_odd:,} of {len(first):,} recordings" if n_odd else ""
     else:
         rivals = {tuple(counted[source].items()) for source in (counted if known else named)}
-        doubt = "" if len(rivals) == 1 else NO_LABEL
+        doubt = "" if named and len(rivals) == 1 else NO_LABEL
     if doubt:
         titles = [*map(title_of, counted, counted.values()), doubt]
         p.put("label.column", UNKNOWN, "; ".join(titles))

@@ -4,15 +4,18 @@ import re
 from collections import Counter
 from dataclasses import replace
 
+import numpy as np
+
 from ...errors import DataError, listed
 from ..description import ANY, UNKNOWN, Channel, TextForm
 from ..read.split import OBJECTS, longest_list, split
 from ..table import Table
+from .clock import EVEN
 from .clock import NAME as CLOCK_NAME
 from .columns import LEAST_RUN, Column, Proposal, Tables, columns_of
 
 PART_NAME = re.compile(
-    r"(?i)part|serial|episode|teil(?!schritt)|werkst(?!.*tr(ä|ae?)ger)|barcode|dmc|trial|piece"
+    r"(?i)part(?!ition)|serial|serien|matricola|episode|teil(?!schritt|enummer|e?typ)|werkst(?!.*tr(ä|ae?)ger)|barcode|dmc|trial|piece"
     r"|sample_?id"
     r"|^(id|run|sn|cycle|shot|nr|no)$|cycle.?(no|nr|id)$|(?<!order)(?<!batch)(?<!shift)(?<!lot)_(id|run|cycle|sn|nr)$"
 )
@@ -39,7 +42,7 @@ def layout_of(p: Proposal, files: Tables) -> str:
     """
     kind = p.description.format
     first = files[0]
-    is_wide = numbered_columns(first)
+    is_wide = numbered_columns(first) and not has_even_clock(first)
     if kind in OBJECTS and len(p.names) > 1 and len(first.lines) == 1 and not is_wide:
         return "files"
     longest = longest_list(first)
@@ -54,7 +57,10 @@ def layout_of(p: Proposal, files: Tables) -> str:
     runs = [column for column in columns.values() if may_tell_parts(column)]
     stated = columns.keys() & {*p.description.part.column}
     if runs or not all(columns[name].fixed for name in stated):
-        likely = [c.name for c in runs if PART_NAME.search(c.name) and len(c.counts) == c.n_runs]
+        # The number of a part changes about as often as any other word.
+        least = max((c.n_runs for c in runs), default=0) / 4
+        parts = [c for c in runs if PART_NAME.search(c.name) and c.n_runs >= least]
+        likely = [c.name for c in parts if len(c.counts) == c.n_runs]
         named = [n for n, c in columns.items() if PART_NAME.search(n) or has_long_runs(c)]
         note = f"one of {listed(named)}, or several"
         p.put("part.column", *(likely if len(likely) == 1 else (UNKNOWN, note)))
@@ -67,6 +73,23 @@ def layout_of(p: Proposal, files: Tables) -> str:
         "no curve is a table of results: nothing can be read"
     )
     return UNKNOWN
+
+
+def has_even_clock(table: Table) -> bool:
+    """Return whether a column that is named like a clock rises in equal steps, 8 or more.
+
+    Steps may differ by 1 % of the median. The rows are then samples.
+    """
+    import pandas as pd
+
+    for name, cells in table.columns.items():
+        if CLOCK_NAME.search(name):
+            texts = pd.Series(cells).astype(str).str.replace(",", ".")
+            steps = np.diff(pd.to_numeric(texts, errors="coerce"))
+            usual = np.median(steps) if len(steps) >= LEAST_RUN else 0.0
+            if usual > 0 and (np.abs(steps - usual) <= EVEN * usual).all():
+                return True
+    return False
 
 
 def has_long_runs(column: Column) -> bool:

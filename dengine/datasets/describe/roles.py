@@ -57,6 +57,7 @@ DATE = re.compile(
     r"|(?<!\d)[0-3]\d[01]\d20[0-3]\d(?!\d)|(?<!\d)[0-3]\d([-_.])[01]\d\5\d\d(?!\d))"
     r"|(?<!\d)(19|20)\d\d([-_.]?)[01]\d\7[0-3]\d"
 )
+UUID = re.compile(r"(?i)(?<![0-9a-f])[0-9a-f]{8}(-?[0-9a-f]{4}){3}-?[0-9a-f]{12}(?![0-9a-f])")
 ODD = (
     "name, if that is the order; the names have dates that are sorted otherwise: rename the files, "
     "with year, month and day in front"
@@ -234,7 +235,8 @@ def propose_channels(p: Proposal, units: Mapping[str, str]) -> None:
     forces = [name for name, unit in units.items() if (quantity_of(unit) or ("",))[0] in LOADS]
     likely = [name for name, unit in units.items() if not unit or name in forces]
     named = [[*filter(pattern.search, likely)] for pattern in FORCES]
-    best = next(filter(None, (*named[:2], forces, named[2], [*units])), [])
+    others = [*dict.fromkeys([*named[1], *forces, *named[2]])]
+    best = next(filter(None, (named[0], others, [*units])), [])
     if not {*best} & {*forces}:
         best = [*best, *forces]  # one has the name, another the unit
     doubts = [*filter(None, (*(_doubt_on(p, name) for name in best), *_other_scales(p)))]
@@ -383,17 +385,24 @@ def propose_order(p: Proposal) -> None:
     that the user stated stays. Raises SettingError for a malformed `windows.trigger`.
     """
     paths = [without_label(p.description.label, without_suffix(name)) for name in p.names]
-    names = [path.rpartition("/")[2] for path in paths]
+    names = sorted((path.rpartition("/")[2] for path in paths), key=natural_key)
     # A folder of a verdict is no step of the production, even if the label stands elsewhere.
     paths = [re.sub(rf"(?i)(?<![^/])({WORD})/", "", path) for path in paths]
     by_folder = [path.rpartition("/")[2] for path in sorted(paths, key=natural_key)]
     # While it is open where the label stands, any folder may be one of a verdict.
-    if p.description.label.column != UNKNOWN and by_folder != sorted(names, key=natural_key):
+    is_clear = by_folder == names and len({*names}) == len(names)
+    if p.description.label.column != UNKNOWN and not is_clear:
         p.put("order", UNKNOWN, "name: by file name, or path: folder by folder")
     matches = [*filter(None, map(DATE.search, names))]
     dates = [match.string[match.start() :] for match in matches]
     if any(match["odd"] for match in matches) or dates != sorted(dates, key=natural_key):
         p.put("order", UNKNOWN, ODD)
+    if names and all(map(UUID.search, names)):
+        p.put("order", UNKNOWN, "name, or path: are random names in the order of production?")
+    numbers = [*part_words(p.description.part, p.tables).values()]
+    if numbers == sorted(numbers) != sorted(numbers, key=natural_key):
+        name = listed(p.description.part.column) or "path"
+        p.put("order", UNKNOWN, f"name, or {name}: part numbers are sorted as texts, 10 before 2")
     for column in p.unused:
         if column.forms or STAMP_NAME.search(column.name):
             ranks = [*map(natural_key, column.fixed)]

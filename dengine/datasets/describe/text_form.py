@@ -7,6 +7,7 @@ import codecs
 import re
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, replace
 from itertools import product
 from operator import itemgetter
@@ -22,7 +23,8 @@ from ..read.files import caught, natural_key
 from ..read.text import BLANK, COMMENT, LATIN, header_names, split_line, to_utf8, to_utf8_or_latin
 from ..table import pattern_of
 from ..units import is_unit
-from .columns import LEAST_RUN, MOST_WORDS, NUMBER, Proposal
+from .clock import EVEN
+from .columns import LEAST_RUN, MOST_WORDS, NUMBER, Proposal, most_frequent
 
 DELIMITERS = ";\t|, "
 BLANKS_LEAD = 1.15  # by which blanks must be the better delimiter, since cells may hold some
@@ -33,6 +35,8 @@ MOST_BYTES = 2_000_000  # of a file that are read
 MOST_LINES = 200  # by which the delimiter and the first row of samples are found
 MOST_NAMES = 20  # columns without a header that get a name each
 DIGITS = re.compile(r"\d+")
+RULE = re.compile("[-=]*")  # a cell of a line that is drawn below the header
+HALF = 0.5  # a header has no more units among its names
 # Lines with a decimal comma: no whole number is written 05, nor stands between other delimiters.
 FRACTION = re.compile(r"-?\d+,0\d+|(?=.*[;\t|])(.*[;\t|])?\s*-?\d+,\d+\s*([;\t|].*)?")
 WHOLE = re.compile(r"-?\d+(\.0*)?(e\+00)?")
@@ -84,6 +88,9 @@ def look(content: bytes, stated: Stated) -> Look:
     data = _first_row(rows[:MOST_LINES], width)
     is_closed = not any(row[-1] for row in rows[data:] if len(row) == width)
     header, units = _head_lines(rows[:data], width - is_closed, stated)
+    words = stated.get("text.header", 0)
+    if isinstance(words, str):
+        header = [line.startswith(words) for line in [*lines[:data], words]].index(True) + 1
     form = TextForm(encoding, delimiter, header=header, units=units, data=data + 1)
     return Look(form, width, is_closed, "".join(lines[header - 1 : header]), rows[data:])
 
@@ -154,7 +161,13 @@ def is_numbering(cells: Sequence[str]) -> bool:
     They rise as `natural_key` sorts texts: 9, 10, but not 0.25, 0.5 or -2, -1.
     """
     numbers = [*filter(NUMBER.fullmatch, cells)]
-    return len(numbers) >= MOST_NAMES and numbers == sorted({*numbers}, key=natural_key)
+    if len(numbers) < MOST_NAMES:
+        return False
+    with suppress(ValueError):  # two marks in a number
+        steps = np.diff([float(number.replace(",", ".")) for number in numbers])
+        if steps.min() > 0 and np.ptp(steps) <= EVEN * steps.max():
+            return True
+    return numbers == sorted({*numbers}, key=natural_key)
 
 
 def _head_lines(rows: Rows, width: int, stated: Stated) -> tuple[int, int]:
@@ -163,19 +176,27 @@ def _head_lines(rows: Rows, width: int, stated: Stated) -> tuple[int, int]:
     The header is the last line with at least `width` cells, the number of columns, and a word,
     which is any cell that is not empty. But if more than half of its words are units, and an
     earlier line is such a line, too, it is the line of the units, and the earlier one is the
-    header. If the header has a unit among its names, or a name twice, and the wide line before it
-    has no empty cell, the line before may be the header instead. DataError is raised then, unless
-    `stated` has the key `text.header`; its value is not used here.
+    header. Before that, two lines are header and units if the second has units only, the first at
+    most half, and all lines from there to the samples have `width` cells. If the header has a unit
+    among its names, or a name twice, and the wide line before it has no empty cell, the line before
+    may be the header instead. DataError is raised then, unless `stated` has the key `text.header`;
+    its value is not used here. A line of dashes is none of these.
 
     rows : the cells of the lines above the samples.
     """
-    heads = [i for i, row in enumerate(rows, 1) if len(row) >= width and any(row)]
+    wide = {i: row for i, row in enumerate(rows, 1) if len(row) >= width}
+    heads = [i for i, row in wide.items() if not all(map(RULE.fullmatch, row))]
+    shares = {i: _share_of_units(rows[i - 1]) for i in heads}
+    for i in reversed(heads):
+        if shares[i] == 1 and shares.get(i - 1, 1) <= HALF:
+            return i - 1, i
+        if i - 1 not in heads:
+            break
     units = 0
     for i in heads[:0:-1]:
-        names = [*filter(None, rows[i - 1])]
-        n = sum(is_unit(name) or bool(UNIT_WORDS.fullmatch(name)) for name in names)
-        if 2 * n <= len(names) or units:
-            is_odd = n or len({*names}) < len(names)
+        if shares[i] <= HALF or units:
+            names = [*filter(None, rows[i - 1])]
+            is_odd = shares[i] or len({*names}) < len(names)
             if is_odd and all(rows[heads[-2] - 1]) and "text.header" not in stated:
                 raise DataError(
                     f"Expected one line of names, lines {heads[-2]} and {i} may be; state "
@@ -184,6 +205,12 @@ def _head_lines(rows: Rows, width: int, stated: Stated) -> tuple[int, int]:
             break
         units = heads.pop()
     return max(heads, default=0), units
+
+
+def _share_of_units(row: Sequence[str]) -> float:
+    """Return the share of units among the cells that are not empty, of which there is one."""
+    words = [*filter(None, row)]
+    return sum(is_unit(word) or bool(UNIT_WORDS.fullmatch(word)) for word in words) / len(words)
 
 
 def propose_form(p: Proposal, contents: Mapping[str, bytes], faults: list[Fault]) -> Sequence[str]:
@@ -205,7 +232,8 @@ def propose_form(p: Proposal, contents: Mapping[str, bytes], faults: list[Fault]
         with caught(faults, name):
             looks[name] = look(content, p.stated)
     forms = {name: (item.form.delimiter, item.width, item.line) for name, item in looks.items()}
-    usual = mode([*forms.values(), ()])
+    sizes = [(forms[name], len(item.rows) * item.width) for name, item in looks.items()]
+    usual = most_frequent([*sizes, ((), 0)])
     same = [name for name, form in forms.items() if form == usual]
     odd = [name for name, form in forms.items() if form != usual]
     p.others = [*p.others, *odd]
@@ -263,7 +291,8 @@ def _column_names(usual: Look) -> Sequence[str]:
     cells = split_line(COMMENT.sub("", usual.line.lstrip()), usual.form.delimiter)
     if len(cells) == width:
         return []
-    if len(cells) >= width - usual.is_closed and not any(map(str.strip, cells[width:])):
+    is_blank = usual.form.delimiter == BLANK  # in names may be blanks
+    if len(cells) >= width - usual.is_closed and not (is_blank and any(cells[width:])):
         return header_names([*cells, ""])[:width]
     if width < MOST_NAMES:
         return [f"c{i}" for i in range(width)]

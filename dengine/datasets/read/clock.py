@@ -123,6 +123,8 @@ def _dates(table: Table, name: str, unit: str, clock: Clock) -> Floats:
     with instead(
         UnreadableError, f"Expected times of the form {unit}", ValueError, AttributeError, re.error
     ):
+        if "%S.%f" in form:  # the fraction may lack in whole seconds
+            texts = texts.str.replace(r"(:\d\d)(?![\d.:])", r"\1.0", regex=True)
         times = pd.to_datetime(texts, format=form, errors="coerce")
         if times.dt.tz is None:
             zone = (has_day(unit) and clock.zone) or "UTC"

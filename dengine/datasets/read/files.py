@@ -15,7 +15,7 @@ from ..description import FOLDER_FILE, Description
 from ..table import UnreadableError
 
 GZIP = ".gz"
-DATE = re.compile(r"(?<![0-9])([0-9]{2})\.([0-9]{2})\.([0-9]{4})(?![0-9])")
+DATE = re.compile(r"(?<![0-9])([0-9]{1,2})\.([0-9]{1,2})\.([0-9]{4})(?![0-9])")
 BAD = (ValueError, NotImplementedError, OSError, IndexError)  # what an unusable pattern raises
 
 

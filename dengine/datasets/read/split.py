@@ -160,7 +160,7 @@ def _split_wide(table: Table, description: Description) -> Iterator[Table]:
     origin: dict[str, list[str]] = {}
     units = {**table.units}
     cells = {name: column for name, column in table.columns.items() if len(column)}
-    for key in filter(lambda key: ANY in key, description.channels):
+    for key in filter(lambda key: ANY in key, (*description.channels, *description.time.column)):
         if names := [match[0] for match in match_numbered(key, table.columns)]:
             origin[key] = names
             units[key] = units.get(names[0], "")

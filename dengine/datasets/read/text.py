@@ -221,7 +221,10 @@ def _read_strictly(content: bytes, table: Table, form: TextForm) -> Table:
     n = len(table.columns)
     rows = dict[int, list[str]]()
     damage = list[UnreadableError]()
-    for i, line in enumerate(content.decode().split("\n"), 1):
+    lines = content.decode().split("\n")
+    while not lines[-1].strip(f" \t{form.delimiter}"):  # a spreadsheet's empty rows at the end
+        lines.pop()
+    for i, line in enumerate(lines, 1):
         if i >= table.lines[0] and line.strip() and not line.startswith(form.drop):
             row = split_line(line, form.delimiter)
             if len(row) != n:
