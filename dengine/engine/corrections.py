@@ -141,8 +141,16 @@ class Corrections:
             return self._as_unchanged("correct", text)
         before = "forgotten" if stored.success is None else f"a {LABEL_TEXTS[stored.success]}"
         text = f"decision {id_} counts as a {LABEL_TEXTS[label]}, was {before}"
-        data = {"decisions": {id_: {"was": stored.success, "now": label}}}
-        return self._change_labels(Change("correct", text, data, author, (id_,), label))
+        return self._change_labels(
+            Change(
+                "correct",
+                text,
+                {"decisions": {id_: {"was": stored.success, "now": label}}},
+                author,
+                (id_,),
+                label,
+            )
+        )
 
     def forget(self, *decision_ids: str, author: str = "", reason: str = "") -> Changed:
         """Leave labels out of all that is learned and counted, from the next decision on.
@@ -199,8 +207,10 @@ class Corrections:
             ids = [stored.decision.id for stored in decisions]
             return self._as_unchanged("forget", f"{_labels_are(ids)} forgotten already")
         text = f"{_labels_are(list(labels))} forgotten" + (f": {reason}" if reason else "")
-        changes = {id_: {"was": label, "now": None} for id_, label in labels.items()}
-        data = {"decisions": changes, "reason": reason}
+        data = {
+            "decisions": {id_: {"was": label, "now": None} for id_, label in labels.items()},
+            "reason": reason,
+        }
         live = self._live
         if live.pinned and any(
             live.trained_on.has_seen(stored.label_seq or 0) for stored in forgotten
@@ -302,8 +312,7 @@ class Corrections:
             return self._as_unchanged("rollback", f"Version {version} is pinned already")
         new = self._live.next_version
         text = f"version {version} answers again, as version {new} after {before}, and is pinned"
-        data = {"to": int(version), "was": before, "now": new}
-        event = Change("rollback", text, data, author)
+        event = Change("rollback", text, {"to": int(version), "was": before, "now": new}, author)
         self._learner.roll_back(int(version), event)
         return self._finish_change(event)
 
@@ -390,12 +399,21 @@ class Corrections:
         evidence = present.evidence
         if starts_anew:
             evidence = EvidenceWindow(since, SAFE_MODES.index(live.newest.safe_mode))
-        recipe = replace(present.recipe, policy=policy)
-        settings = replace(present, recipe=recipe, policy_since=since, evidence=evidence)
+        settings = replace(
+            present,
+            recipe=replace(present.recipe, policy=policy),
+            policy_since=since,
+            evidence=evidence,
+        )
         steps = [f"{name} {old_values[name]} -> {value}" for name, value in changes.items()]
         text = f"the policy's {', '.join(steps)}"
-        data = {"old": old_values, "new": new_values}
-        event = Change(POLICY_CHANGED, text, data, author, settings=settings.to_store())
+        event = Change(
+            POLICY_CHANGED,
+            text,
+            {"old": old_values, "new": new_values},
+            author,
+            settings=settings.to_store(),
+        )
         self._learner.set_policy(policy if starts_anew else None, evidence, event)
         self._settings.change(settings)
         self._feedback.begin_policy()

@@ -187,8 +187,9 @@ class DecisionMaker:
         """
         if self._outbox.verify_all_reason:
             verify_reason = Reason.NO_STORE
-        item = self._decide(x, part, self._live.answering, verify_reason, decision_id)
-        return self._outbox.record_decision(item)
+        return self._outbox.record_decision(
+            self._decide(x, part, self._live.answering, verify_reason, decision_id)
+        )
 
     def sync(self, stored: StoredDecision) -> StoredDecision:
         """Wait until a decision and all earlier records are on disk; return the valid decision.
@@ -205,8 +206,9 @@ class DecisionMaker:
             # A decision that lets a part go on unchecked must outlive this process, or its id would
             # have two answers.
             if decision.action is not Action.VERIFY:
-                item = self._decide(stored.trace, decision.part, None, Reason.NO_STORE, decision.id)
-                return self._outbox.replace_decision(item)
+                return self._outbox.replace_decision(
+                    self._decide(stored.trace, decision.part, None, Reason.NO_STORE, decision.id)
+                )
         return stored
 
     def record_timeout(self, trace: ArrayLike, part: Any, decision_id: Any) -> Decision:
@@ -300,8 +302,9 @@ class DecisionMaker:
             part=part,
         )
         # The caller may change his own array.
-        hash_ = part_hash_ or content
-        return StoredDecision(decision, x.copy(), hash_, fault != 0, self._outbox.store.clock())
+        return StoredDecision(
+            decision, x.copy(), part_hash_ or content, fault != 0, self._outbox.store.clock()
+        )
 
 
 def _verify(x: TraceArray, conditions: DecisionConditions, reason: Reason) -> Verdict:

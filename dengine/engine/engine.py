@@ -245,8 +245,9 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         if store.product is not None:
             peers = Peers(self._outbox, self._live, window, clock)
         self._feedback = Feedback(self._outbox, self._live, window, self._settings, on_safe_mode)
-        budget = None if replaying else recipe.budget
-        retrainer = Retrainer(window, budget, recipe.max_steps, executor, clock)
+        retrainer = Retrainer(
+            window, None if replaying else recipe.budget, recipe.max_steps, executor, clock
+        )
         self._learner = Learner(
             self._outbox, self._live, window, self._feedback, peers, retrainer, clock
         )

@@ -198,8 +198,9 @@ class Feedback:
             if (earlier, reported) != LATE_STOP:
                 raise already_reported(decision.id, earlier, reported)
             self.remedy = Remedy.CORRECT
-            label = NewLabel(decision.id, False, source, self._live.version, None)
-            self._outbox.record_labels([(stored, label)])
+            self._outbox.record_labels(
+                [(stored, NewLabel(decision.id, False, source, self._live.version, None))]
+            )
             return
         self._learn_and_record(stored, success, source)
         self._unreported.pop(decision.id, None)
@@ -347,8 +348,9 @@ class Feedback:
             return
         self._safe_mode = safe_mode
         try:
-            kind = SAFE_MODE_BEGAN if safe_mode else SAFE_MODE_ENDED
-            self._outbox.record_event(kind, safe_mode or reason_ended)
+            self._outbox.record_event(
+                SAFE_MODE_BEGAN if safe_mode else SAFE_MODE_ENDED, safe_mode or reason_ended
+            )
             if self._on_safe_mode is not None:
                 self._on_safe_mode(safe_mode)
         except Exception:

@@ -641,8 +641,12 @@ class Learner:
             return
         if self.live.pinned:
             version = self.live.version
-            text = f"version {version} is fitted again, to labels as they count now"
-            self.roll_back(version, Change("rollback", text))
+            self.roll_back(
+                version,
+                Change(
+                    "rollback", f"version {version} is fitted again, to labels as they count now"
+                ),
+            )
         else:
             self.retrain(wait=True)
 
@@ -673,10 +677,15 @@ class Learner:
         and nothing changes.
         """
         live = self.live
-        text = f"version {live.version} is pinned no more: the next retrain may replace it"
-        event = Change("release", text, {"was": live.version, "now": live.next_version}, author)
-        trained_on = replace(live.trained_on, pinned=0)
-        self._store_and_swap_in(event, live.newest, trained_on, "released, the same model", 0.0)
+        event = Change(
+            "release",
+            f"version {live.version} is pinned no more: the next retrain may replace it",
+            {"was": live.version, "now": live.next_version},
+            author,
+        )
+        self._store_and_swap_in(
+            event, live.newest, replace(live.trained_on, pinned=0), "released, the same model", 0.0
+        )
         return event
 
     def roll_back(self, number: int, event: Change) -> None:
@@ -713,8 +722,9 @@ class Learner:
         newest = self._window.newest_seq
         add_labels_since(model, self._store, version, self._window.capacity, shared_to=newest)
         trained_on = replace(trained_on, counts_from=newest, pinned=number)
-        reason = f"rolled back to version {number}"
-        self._store_and_swap_in(event, model, trained_on, reason, self._clock() - begin)
+        self._store_and_swap_in(
+            event, model, trained_on, f"rolled back to version {number}", self._clock() - begin
+        )
         self._is_requested = False  # what was asked for was to replace another version
         self.feedback.count_new_labels(newest)
         self._precompute_other_start()
@@ -756,9 +766,11 @@ class Learner:
         report = RetrainReport(
             self.live.next_version, seconds, len(trained_on.seq), 0, True, reason
         )
-        state = self.live.get_state(model, trained_on)
         self._store.corrections.apply(
-            replace(event, version=(report, self._window.newest_seq, state))
+            replace(
+                event,
+                version=(report, self._window.newest_seq, self.live.get_state(model, trained_on)),
+            )
         )
         self.live.swap_in(model, report.version, trained_on)
         self._report = report

@@ -151,10 +151,13 @@ class LiveModel:
             trained_on = TrainedOn.from_state(version.state)
             # A later version may be damaged: what an earlier one's rule learned under another
             # policy is left out.
-            with_rule = version.version >= since
             with suppress(ChangedTracesError):
                 model = restore_model(
-                    self.outbox, self.template, version, trained_on, with_rule=with_rule
+                    self.outbox,
+                    self.template,
+                    version,
+                    trained_on,
+                    with_rule=version.version >= since,
                 )
         past = read_rule_progress(
             store, None if model is None else version, since, label_within, policy_since
@@ -163,8 +166,9 @@ class LiveModel:
         self.overdue_to = past.overdue_to
         if version is None or model is None:
             self._start_rule(self._read_outcomes(0))
-            numbers = (correction.number for correction in store.corrections.after())
-            self.corrected_to = max(numbers, default=0)
+            self.corrected_to = max(
+                (correction.number for correction in store.corrections.after()), default=0
+            )
             return
         self.swap_in(model, version.version, trained_on)
         guarded(NOT_READY, model.prepare, self.template)
@@ -222,7 +226,6 @@ class LiveModel:
         if model is None:
             return None
         # An embedding that this very version computed for the decision is not computed again.
-        embedding = decision.embedding if decision.model_version == self.version else None
         point = guarded(
             NO_REFERENCE,
             model.add_reference,
@@ -230,7 +233,7 @@ class LiveModel:
             int(success),
             stored.content_hash,
             number,
-            embedding=embedding,
+            embedding=decision.embedding if decision.model_version == self.version else None,
         )
         return point if model.keeps_references else None
 

@@ -390,8 +390,7 @@ def read_peers_trace_spec(store: "SqlStore") -> TraceSpec | None:
 
     It is that of the first cell that has one. Raises StoreError if it is damaged.
     """
-    specs = map(stored_trace_spec, store.settings.of_peers().values())
-    return next(filter(None, specs), None)
+    return next(filter(None, map(stored_trace_spec, store.settings.of_peers().values())), None)
 
 
 def agreed_trace_spec(store: "SqlStore", stated: TraceSpec | None) -> TraceSpec | None:

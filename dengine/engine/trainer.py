@@ -77,8 +77,7 @@ class TrainingWindow:
         """
         if self._end == len(self._block[0]):
             self._enlarge(trace.shape)
-        row = (seq, trace, label, hash_)
-        for column, value in zip(self._block, row, strict=True):
+        for column, value in zip(self._block, (seq, trace, label, hash_), strict=True):
             column[self._end] = value
         self._end += 1
         self._first = max(self._first, self._end - self.capacity)
@@ -475,8 +474,7 @@ def train_candidate(
     torch.set_num_threads(1)  # it holds for the present thread only
     guarded(NOT_PRECOMPUTED, successor.warm_up)
     begin = clock()
-    deadline = None if step_seconds is None else begin + step_seconds
-    stop = StopRule(deadline, max_steps, clock)
+    stop = StopRule(None if step_seconds is None else begin + step_seconds, max_steps, clock)
     model: EngineModel | None = None
     n_steps = 0
     try:
