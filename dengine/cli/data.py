@@ -87,8 +87,11 @@ def data(
     path = None
     shown = ""
     if description is not None:
-        n_found = len(dataset) + dataset.unlabelled + len(dataset.faults)
-        seen = Seen(recordings=n_found, good=survey.good, bad=survey.bad)
+        seen = Seen(
+            recordings=len(dataset) + dataset.unlabelled + len(dataset.faults),
+            good=survey.good,
+            bad=survey.bad,
+        )
         path = _save(source, replace(description, seen=seen), save, context)
         shown = description.to_toml()
     last_line = ""
@@ -230,15 +233,15 @@ def simulate(n: int, out: Path, scenario: str, seed: int, n_jobs: int, force: bo
         insertions = simulate_insertions(n, seed, scenario, n_jobs, progress=advance)
     path = save_insertions(out, insertions, force)
     successes = sum(insertion.success for insertion in insertions)
-    record = {
-        "simulated": True,
-        "scenario": scenario,
-        "n": n,
-        "successes": successes,
-        "file": path,
-    }
     print_result(
-        record, f"Simulated {n} insertions ({scenario}): {successes} successes. Wrote {path}"
+        {
+            "simulated": True,
+            "scenario": scenario,
+            "n": n,
+            "successes": successes,
+            "file": path,
+        },
+        f"Simulated {n} insertions ({scenario}): {successes} successes. Wrote {path}",
     )
 
 

@@ -126,8 +126,10 @@ def history(store: str, events: bool, **criteria: Any) -> None:
     end = math.inf if criteria["until"] is None else criteria["until"]
     for name, items in others.items():
         others[name] = [item for item in items if since <= item.time < end]
-    rows = [to_jsonable(decision) | {"label": decision.label} for decision in decisions]
-    record = {"store": store, "decisions": rows} | others
+    record = {
+        "store": store,
+        "decisions": [to_jsonable(decision) | {"label": decision.label} for decision in decisions],
+    } | others
     in_order = merge(*others.values(), decisions, key=lambda item: item.time)
     print_result(record, _history_table(list(in_order)))
 

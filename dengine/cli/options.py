@@ -251,19 +251,22 @@ def store_option(text: str, *names: str, required: bool = False) -> Option:
     required : bool, default False
         Whether `--store` must be given.
     """
-    options: dict[str, Option] = {
-        "store": click.option("--store", required=required, metavar="FILE|URL", help=text),
-        "cell_id": click.option(*names, "--cell-id", "cell_id", metavar="NAME", help=_CELL_ID),
-        "product": click.option(
-            "--product",
-            metavar="NAME",
-            help=(
-                "What the cell makes: cells of one product share labels and versions.  "
-                "[default: as the store says]"
+    return bundle_options(
+        "store",
+        _address,
+        {
+            "store": click.option("--store", required=required, metavar="FILE|URL", help=text),
+            "cell_id": click.option(*names, "--cell-id", "cell_id", metavar="NAME", help=_CELL_ID),
+            "product": click.option(
+                "--product",
+                metavar="NAME",
+                help=(
+                    "What the cell makes: cells of one product share labels and versions.  "
+                    "[default: as the store says]"
+                ),
             ),
-        ),
-    }
-    return bundle_options("store", _address, options)
+        },
+    )
 
 
 def short_name(name: str) -> str:
@@ -830,8 +833,9 @@ def out_option(
             check_output(out / name, force)
         return Out(out, force)
 
-    options = {"out": click.option("--out", type=kind, help=text), "force": force_option}
-    return bundle_options("out", make_out, options)
+    return bundle_options(
+        "out", make_out, {"out": click.option("--out", type=kind, help=text), "force": force_option}
+    )
 
 
 picture_option = out_option(

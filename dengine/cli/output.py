@@ -237,8 +237,11 @@ def table_of_records(title: str, records: Iterable[Any], *names: str) -> "Table"
     `heading` makes the titles of the columns, and `format_value` the cells. Without records it has
     the titles only. Raises AttributeError for a field that a record lacks.
     """
-    rows = [[format_value(name, getattr(record, name)) for name in names] for record in records]
-    return table_of_rows(title, rows, [heading(name) for name in names])
+    return table_of_rows(
+        title,
+        [[format_value(name, getattr(record, name)) for name in names] for record in records],
+        [heading(name) for name in names],
+    )
 
 
 def field_rows(record: Any, *left_out: str) -> Iterator[tuple[str, str]]:
@@ -393,8 +396,12 @@ def progress_bar(label: str, total: int | None) -> Iterator[Callable[[int], None
     from rich.console import Console
     from rich.progress import MofNCompleteColumn, Progress
 
-    columns = (*Progress.get_default_columns(), MofNCompleteColumn())
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+    with Progress(
+        *Progress.get_default_columns(),
+        MofNCompleteColumn(),
+        console=Console(stderr=True),
+        transient=True,
+    ) as bar:
         task = bar.add_task(without_password(label), total=total)
         yield lambda n: bar.advance(task, n)
 

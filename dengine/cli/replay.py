@@ -268,8 +268,9 @@ def compare(
 
     grid: dict[str, Any] = {**(PAPER_GRID if paper else {}), **lists}
     _refuse_value_beside_list(settings, grid)
-    contenders = [RecipeChoice(name, settings).make_contender() for name in names]
-    _replay_and_print(contenders, grid, **played)
+    _replay_and_print(
+        [RecipeChoice(name, settings).make_contender() for name in names], grid, **played
+    )
 
 
 def _refuse_value_beside_list(settings: Options, lists: Iterable[str]) -> None:

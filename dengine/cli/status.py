@@ -106,8 +106,9 @@ def _overview_table(store: str, report: "Status") -> Any:
         [TITLES.get(name, heading(name)), *(_span_cell(name, span) for span in spans)]
         for name in names
     ]
-    columns = ("", f"last {report.newest.decisions:,}", "since birth")
-    return table_of_rows(f"{store}: overview", rows, columns)
+    return table_of_rows(
+        f"{store}: overview", rows, ("", f"last {report.newest.decisions:,}", "since birth")
+    )
 
 
 def _present_rows(report: "Status") -> list[tuple[str, str]]:

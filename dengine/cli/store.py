@@ -329,8 +329,10 @@ def verify(
                 with SqlStore(store, item.cell_id) as opened:
                     opened.events.acknowledge_losses(author)
             report = verify_history(store, cell, expect, advance)
-    record = {"store": store, "ok": report.ok, "cells": report.cells, "faults": report.faults}
-    print_result(record, *_verification_lines(report))
+    print_result(
+        {"store": store, "ok": report.ok, "cells": report.cells, "faults": report.faults},
+        *_verification_lines(report),
+    )
     if not report.ok:
         context.exit(1)
 

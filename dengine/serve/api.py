@@ -79,8 +79,7 @@ def field_types(record: type, *without: str) -> Json:
     The types are the annotations of the class, evaluated and without `Annotated`, in the order of
     the fields. A name in `without` that is no field has no effect.
     """
-    hints = get_type_hints(record)
-    return {name: hint for name, hint in hints.items() if name not in without}
+    return {name: hint for name, hint in get_type_hints(record).items() if name not in without}
 
 
 def _request_type(handler: Callable[..., Any], optional_fields: Json) -> type[Struct]:
@@ -414,8 +413,9 @@ def json_response(
     NumPy arrays become lists. `status` is the HTTP status, `headers` are added to the response, and
     `media` is its media type. Raises AttributeError for an object that JSON has no type for.
     """
-    content = msgspec.json.encode(body, enc_hook=methodcaller("tolist"))
-    return Response(content, status, headers, media)
+    return Response(
+        msgspec.json.encode(body, enc_hook=methodcaller("tolist")), status, headers, media
+    )
 
 
 def problem_response(
@@ -431,8 +431,12 @@ def problem_response(
     """
     retry = {"Retry-After": str(RETRY_SECONDS)} if status == 503 else {}
     line = " ".join(without_password(detail).split())
-    problem = Problem(HTTPStatus(status).phrase, status, line)
-    return json_response(problem, status, retry | dict(headers or {}), PROBLEM)
+    return json_response(
+        Problem(HTTPStatus(status).phrase, status, line),
+        status,
+        retry | dict(headers or {}),
+        PROBLEM,
+    )
 
 
 def _error_response(request: Request, error: Any) -> Response:
@@ -450,8 +454,7 @@ def _error_response(request: Request, error: Any) -> Response:
     for error_type, status in STATUSES.items():
         if isinstance(error, error_type):
             return problem_response(status, as_options(str(error)))
-    path = request.scope["path"]
-    log.error("a request failed: %s %s", request.method, path, exc_info=error)
+    log.error("a request failed: %s %s", request.method, request.scope["path"], exc_info=error)
     return problem_response(500, "The server failed at this request; its log says why.")
 
 
@@ -573,8 +576,13 @@ class Operation:
             return description
         body = _json_content(self.request_type.__name__)
         if self.raw_parameter:
-            text = "float32, little-endian."
-            body[RAW] = {"schema": {"type": "string", "format": "binary", "description": text}}
+            body[RAW] = {
+                "schema": {
+                    "type": "string",
+                    "format": "binary",
+                    "description": "float32, little-endian.",
+                }
+            }
         return description | {"requestBody": {"required": True, "content": body}}
 
 

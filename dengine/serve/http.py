@@ -105,7 +105,6 @@ class HttpApi:
         """
         # A guarantee may name a class, and no request over the network may cause an import.
         policy = field_types(Policy, "guarantee") | {"force_limits": list[str]}
-        filter_ = field_types(HistoryFilter)
         return [
             Operation("POST", "/decide", self.decide, "DecideResponse", raw_parameter="trace"),
             Operation("POST", "/report", self.report, "ReportResponse"),
@@ -116,7 +115,7 @@ class HttpApi:
             Operation("POST", "/policy", self.policy, "Changed", policy),
             Operation("POST", "/retrain", self.retrain, "Changed"),
             Operation("GET", "/status", self.status, "Status"),
-            Operation("GET", "/decisions", self.decisions, "Decisions", filter_),
+            Operation("GET", "/decisions", self.decisions, "Decisions", field_types(HistoryFilter)),
             Operation("GET", "/decisions/{id:path}", self.decision, "Decision"),
             Operation("GET", "/explanations/{id:path}", self.explanation, "Explanation"),
             Operation("GET", "/course", self.course, "Course"),
@@ -595,8 +594,11 @@ def create_app(
         *(Route(path, _index_page) for path in VIEWS),
         Mount("/page/static", StaticFiles(directory=STATIC)),
     ]
-    guard = Middleware(Guard, tokens=tokens)
-    app = Starlette(routes=routes, middleware=[guard], exception_handlers=api.HANDLERS)
+    app = Starlette(
+        routes=routes,
+        middleware=[Middleware(Guard, tokens=tokens)],
+        exception_handlers=api.HANDLERS,
+    )
     # A robot does not follow redirects, whose target a request's Host would determine.
     app.router.redirect_slashes = False
     return app

@@ -280,8 +280,9 @@ def listening_socket(host: str, port: int) -> Iterator[socket.socket]:
         UnicodeError,
         do="name another port or address, --port or --host",
     ):
-        family = socket.AF_INET6 if ":" in host else socket.AF_INET
-        listening = socket.create_server((host, port), family=family)
+        listening = socket.create_server(
+            (host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET
+        )
     with listening:
         # Its connections inherit this option. Without it the second piece of a response waits 40 ms
         # for the confirmation of the first.

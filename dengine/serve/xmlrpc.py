@@ -48,8 +48,9 @@ def parse_call(body: bytes) -> tuple[str, tuple[Any, ...]]:
         arguments = values.close()
         name = values.getmethodname()
     except Exception as error:  # malformed XML raises many types
-        kind = type(error).__name__
-        raise ValueError(f"Expected an XML-RPC call, got what cannot be read: {kind}.") from error
+        raise ValueError(
+            f"Expected an XML-RPC call, got what cannot be read: {type(error).__name__}."
+        ) from error
     if name is None:
         raise ValueError("Expected an XML-RPC call, got XML without a method's name.")
     return name, arguments
@@ -65,8 +66,7 @@ def rpc_route(calls: RobotCalls) -> Route:
         """Respond with a value or a fault in XML; HTTPException 415 for another media type."""
         if media_type(request) not in ("text/xml", "application/xml"):
             raise HTTPException(415, "Expected an XML-RPC call, Content-Type: text/xml.")
-        xml = await call_method(calls, await request.body())
-        return Response(xml, media_type="text/xml")
+        return Response(await call_method(calls, await request.body()), media_type="text/xml")
 
     return Route(RPC, rpc, methods=["POST"])
 
