@@ -409,8 +409,9 @@ def needed_parts(policy: Policy) -> int:
     guarantees it is 0.
     """
     if policy.guarantee == "local":
-        counts = range(1, MOST_NEIGHBOURS)
-        return 1 + bisect_left(counts, policy.lower_bound, key=lambda n: policy.bound(n, 0)[0])
+        return 1 + bisect_left(
+            range(1, MOST_NEIGHBOURS), policy.lower_bound, key=lambda n: policy.bound(n, 0)[0]
+        )
     if policy.guarantee == "pooled":
         evidence: Any = policy.rule().evidence
         steps: list[float] = evidence.level_steps[0]
@@ -567,8 +568,13 @@ def find_policy(
     chosen = finished or _finished(screened, policies)
     if not chosen:
         return None
-    left_behind = tuple(row for policy, row in rows.items() if policy not in policies)
-    return curve_of(chosen, costs, left_behind, tuple(out_of_reach), fresh=bool(finished))
+    return curve_of(
+        chosen,
+        costs,
+        tuple(row for policy, row in rows.items() if policy not in policies),
+        tuple(out_of_reach),
+        fresh=bool(finished),
+    )
 
 
 def _finished(replays: Iterable[Replay], policies: Sequence[Policy]) -> Groups:

@@ -225,8 +225,14 @@ def _draw_neighbourhood(figure: Figure, centre: Floats, radius: float, is_strip:
                 axes.axvline(end, color=BLACK, linewidth=1.4)
         else:
             axes.add_patch(Circle((x, y), radius, fill=False, edgecolor=BLACK, linewidth=1.4))
-        label = f"newest part; its neighbourhood ends at the black line, radius {radius:g}"
-        (mark,) = axes.plot(x, y, "+", color=BLACK, markersize=9, label=label)
+        (mark,) = axes.plot(
+            x,
+            y,
+            "+",
+            color=BLACK,
+            markersize=9,
+            label=f"newest part; its neighbourhood ends at the black line, radius {radius:g}",
+        )
     figure.legend(handles=[mark], loc="outside lower center", frameon=False, fontsize=SMALL)
 
 
@@ -274,15 +280,16 @@ def window_curves(replays: Sequence[Replay], window: int = WINDOW, fewest: int =
         return (count(wrong) / n_decided).where(n_decided >= fewest)
 
     false_positive = share("false_positive", "accepted")
-    shares = {
-        "certain": certain.mean(axis=1),
-        "certain_low": certain.quantile(0.1, axis=1),
-        "certain_high": certain.quantile(0.9, axis=1),
-        "precision": 1.0 - false_positive,
-        "false_positive": false_positive,
-        "false_negative": share("false_negative", "rejected"),
-    }
-    return 100.0 * pd.DataFrame(shares)
+    return 100.0 * pd.DataFrame(
+        {
+            "certain": certain.mean(axis=1),
+            "certain_low": certain.quantile(0.1, axis=1),
+            "certain_high": certain.quantile(0.9, axis=1),
+            "precision": 1.0 - false_positive,
+            "false_positive": false_positive,
+            "false_negative": share("false_negative", "rejected"),
+        }
+    )
 
 
 def curves(by_recipe: Mapping[str, Sequence[Replay]], title: str = "") -> Figure:
@@ -354,8 +361,11 @@ def curves(by_recipe: Mapping[str, Sequence[Replay]], title: str = "") -> Figure
     finish(precision, ylabel="precision\n[% of accepted]")
     precision.set_ylim(max(0.0, min(precision.get_ylim()[0], bounds[0] - 1)), 100.5)
     # At least half as much again above the tolerance: the panel shows whether errors keep to it.
-    highest = max(errors.get_ylim()[1], 1.5 * tolerances[0])
-    finish(errors, ylim=(0, highest), ylabel="bad of accepted, good of\nrejected (dashed) [%]")
+    finish(
+        errors,
+        ylim=(0, max(errors.get_ylim()[1], 1.5 * tolerances[0])),
+        ylabel="bad of accepted, good of\nrejected (dashed) [%]",
+    )
     errors.set(
         xlabel=f"cycle (end of a window of {window}; a share of fewer than {FEWEST} parts is not "
         "drawn)"
@@ -400,11 +410,10 @@ def cost_picture(curve: CostCurve, unit: str = "s") -> Figure:
     left.axvline(costs.check, label="check everything", **LIMIT)
     for y, row in enumerate(rows):
         is_last = y < n_last
-        errors = [[row.cost - max(row.lower, 0.0)], [min(row.upper, end) - row.cost]]
         left.errorbar(
             row.cost,
             y,
-            xerr=errors,
+            xerr=[[row.cost - max(row.lower, 0.0)], [min(row.upper, end) - row.cost]],
             label=labels.get(y, "_"),
             color=BLUE,
             markerfacecolor=BLUE if is_last else "none",
@@ -518,8 +527,15 @@ def _draw_neighbours(axes: Axes, x: Floats, explanation: Explanation, channel: i
         ]
         for i, trace in enumerate(traces):
             # matplotlib leaves labels that begin with _ out of the legend.
-            label = "_" if i else f"neighbours that were {name} ({len(traces)})"
-            axes.plot(x, trace, line, label=label, color=colour, linewidth=0.7, alpha=0.55)
+            axes.plot(
+                x,
+                trace,
+                line,
+                label="_" if i else f"neighbours that were {name} ({len(traces)})",
+                color=colour,
+                linewidth=0.7,
+                alpha=0.55,
+            )
 
 
 def _draw_band(
@@ -588,6 +604,13 @@ def _draw_drift(figure: Any, data: Dataset, finite: NDArray[np.bool_], label: st
     finish(top, ylim=(0, 104), ylabel="share [%]")
     for success, name, colour, _, _ in LABEL_STYLES:
         rows = finite & (y == success)
-        means = data.cube[rows, 0].mean(axis=1, dtype=np.float64)
-        bottom.scatter(x[rows], means, s=8, color=colour, alpha=0.5, linewidths=0, label=name)
+        bottom.scatter(
+            x[rows],
+            data.cube[rows, 0].mean(axis=1, dtype=np.float64),
+            s=8,
+            color=colour,
+            alpha=0.5,
+            linewidths=0,
+            label=name,
+        )
     finish(bottom, xlabel="recording, in the order in which they were made", ylabel=f"mean {label}")

@@ -328,8 +328,9 @@ def iterate_replays(
     for name in sorted({tasks[i].contender.baseline or "" for i in missing} - {""}):
         baseline_class(name)
     parallel = Parallel(n_jobs=n_jobs, return_as="generator_unordered")
-    callback = on_cycle if n_jobs == 1 else None
-    for i, played in parallel(delayed(_play)(data, i, tasks[i], callback) for i in missing):
+    for i, played in parallel(
+        delayed(_play)(data, i, tasks[i], on_cycle if n_jobs == 1 else None) for i in missing
+    ):
         if kept_replays is not None:
             kept_replays.put(tasks[i], played)
         yield PlayedReplay(i, played, False)

@@ -120,8 +120,7 @@ class Contender:
             return recipe
         if isinstance(recipe, str) and recipe in BASELINES:
             # conv has a schedule of its own; baselines retrain by the default one.
-            schedule = Recipe(retrain_every=Reducer.default_retrain_every)
-            return cls(recipe, schedule, recipe)
+            return cls(recipe, Recipe(retrain_every=Reducer.default_retrain_every), recipe)
         loaded = Recipe.load(recipe)
         is_path = isinstance(recipe, str | os.PathLike)
         is_named = is_path and (str(recipe) in RECIPES or Path(recipe).is_file())
@@ -433,12 +432,11 @@ def to_replay(observed: Sequence[ObservedCycle], recipe: Recipe) -> Replay:
         name: np.array([getattr(decision, name) for decision in decisions], dtype=dtype)
         for name, dtype in DECISION_FIELDS.items()
     }
-    stopped = [cycle.outcome is Outcome.STOPPED for cycle in cycles]
     return Replay(
         truth=np.array([truth for _, truth in observed], dtype=np.float64),
         position=_positions(decisions),
         decide_seconds=np.array([cycle.decide_seconds for cycle in cycles], dtype=np.float64),
-        stopped=np.array(stopped, dtype=np.bool_),
+        stopped=np.array([cycle.outcome is Outcome.STOPPED for cycle in cycles], dtype=np.bool_),
         version=np.array([decision.model_version for decision in decisions], dtype=np.int64),
         safe_mode=np.array([cycle.safe_mode != "" for cycle in cycles], dtype=np.bool_),
         retrains=tuple(cycle.retrain for cycle in cycles if cycle.retrain is not None),
@@ -656,5 +654,8 @@ def replay_policy(scores: Replay, policy: Policy) -> Replay:
             rule.observe(n_unreported, bool(novel[i]))
             rule.update(lower, upper, success, predicted, 0.0 if actions[i] else asked_with)
             n_unreported = 0
-    recipe = replace(scores.recipe, policy=policy)
-    return replace(scores, action=np.array(ACTIONS)[actions].astype(np.str_), recipe=recipe)
+    return replace(
+        scores,
+        action=np.array(ACTIONS)[actions].astype(np.str_),
+        recipe=replace(scores.recipe, policy=policy),
+    )

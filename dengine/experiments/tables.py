@@ -270,5 +270,9 @@ def write_csv(frame: pd.DataFrame, path: str | Path, force: bool = False) -> Pat
     OutputError
         The file exists and `force` is not set, or it cannot be written.
     """
-    text = frame.to_csv(index=False, lineterminator="\n")
-    return write_output(path, text.encode("utf-8"), force, make_folder=True)
+    return write_output(
+        path,
+        frame.to_csv(index=False, lineterminator="\n").encode("utf-8"),
+        force,
+        make_folder=True,
+    )

@@ -297,8 +297,10 @@ def import_journal(store: "StoreLike", path: FilePath, any_model: bool = False) 
                 f"{path} belongs to {journal.sum[:12]}…, which is none of its exports; "
                 "name the store that it came from, or say --any-model if it is right."
             )
-        lines = _with_known_outcomes(journal, policy.stops)
-        parts = [(line.decision, line.trace, line.label) for line in lines]
+        parts = [
+            (line.decision, line.trace, line.label)
+            for line in _with_known_outcomes(journal, policy.stops)
+        ]
         report = import_parts(opened, parts, spec, policy)
     if opened is not store:
         opened.close()

@@ -229,8 +229,9 @@ class OnnxModel:
         for a wrong shape, a T that is refused, and values that are no real numbers.
         """
         action, reason, *counted, z = self.session.run(None, {"trace": as_trace(trace, self.trace)})
-        numbers = (value.item() for value in counted)
-        return ExportedDecision._make((ACTIONS[action], REASONS[reason], *numbers, z))
+        return ExportedDecision._make(
+            (ACTIONS[action], REASONS[reason], *(value.item() for value in counted), z)
+        )
 
 
 class OnnxDecision(nn.Module):

@@ -350,8 +350,7 @@ def load_exported(path: FilePath, *, key: FilePath | None = None) -> ExportedMod
     with instead(
         ExportError, f"{target} has its checksum but is no loadable TorchScript", RuntimeError
     ):
-        file = io.BytesIO(content)
-        module = torch.jit.load(file, map_location="cpu").eval()  # type: ignore[no-untyped-call]
+        module = torch.jit.load(io.BytesIO(content), map_location="cpu").eval()  # type: ignore[no-untyped-call]
     with instead(
         ExportError,
         f"{target} is not a dengine export: its description does not fit its module",

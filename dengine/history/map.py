@@ -111,9 +111,12 @@ def part_map(store: "SqlStore", recipe: Recipe, version: int) -> PartMap:
     for item in recent[-N_NEWEST:]:
         decision = item.decision
         if decision.model_version == version and decision.embedding is not None:
-            place = _first_two(np.mean(decision.embedding, axis=0))
             newest[decision.id] = Mark(
-                decision.id, decision.part, *place, item.success, decision.action
+                decision.id,
+                decision.part,
+                *_first_two(np.mean(decision.embedding, axis=0)),
+                item.success,
+                decision.action,
             )
     references: list[Mark] = []
     if version and (past := load_past_version(store, version, recipe, None)) is not None:

@@ -117,8 +117,9 @@ def load_past_version(
         ]
     before = store.labels.past(int(stored.state["trained_on"][0]) - 1, stored.last_seq)
     by_number = {label.seq: label for label in (*before, *later) if not label.quarantined}
-    added = [label for label in later if label.model_version == version]
-    index = _restore_index(stored, added, recipe)
+    index = _restore_index(
+        stored, [label for label in later if label.model_version == version], recipe
+    )
     return PastVersion(
         index=index,
         labels=[by_number.get(number) for number in index.column("numbers").tolist()],
@@ -143,11 +144,10 @@ def _restore_index(stored: ModelVersion, added: list[PastLabel], recipe: Recipe)
     index = RadiusIndex.from_state(stored.state, n if is_full else max(n, recipe.window))
     for label in added:
         if label.point is not None:
-            fold = int(fold_of(label.content_hash, spaces))
             index.add_one(
                 torch.from_numpy(label.point),
                 float(label.success),
-                fold,
+                int(fold_of(label.content_hash, spaces)),
                 label.content_hash,
                 label.seq,
             )

@@ -554,8 +554,7 @@ class ModelPrediction(EngineModel):
         """
         encoder = self.spaces.module()
         if encoder is not None and self.rule.scriptable:
-            eager = self._eager_decider(encoder, conditions)
-            decider: Decider = compiled(eager, self.trace_shape)
+            decider: Decider = compiled(self._eager_decider(encoder, conditions), self.trace_shape)
             return decider
         encoder = InPython(self.spaces) if encoder is None else script(encoder)
         decider = self._eager_decider(encoder, conditions)
@@ -572,8 +571,12 @@ class ModelPrediction(EngineModel):
         `build_decider`. Raises SettingError if the force limits do not fit the traces, and
         AttributeError if nothing was fitted.
         """
-        neighbours = self.classifier.neighbours_over(self.index, self.rule, self.spaces.scores)
-        predictor = Predictor(encoder, torch.from_numpy(self.scale), self.gate, neighbours)
+        predictor = Predictor(
+            encoder,
+            torch.from_numpy(self.scale),
+            self.gate,
+            self.classifier.neighbours_over(self.index, self.rule, self.spaces.scores),
+        )
         conditions = conditions or DecisionConditions(self.trace_spec)
         return Decider(predictor, conditions, (self.n_spaces, self.index.dim)).eval()
 

@@ -274,8 +274,9 @@ class SimulatedCell:
             raise DengineError(
                 "Expected verify(), proceed() or reject() after insert(), got insert(); call one."
             )
-        changed = self._change(self.parameters, self._done, self.cycles)
-        insertion = insert_once(changed, self.seed, self._done)
+        insertion = insert_once(
+            self._change(self.parameters, self._done, self.cycles), self.seed, self._done
+        )
         self.last = insertion
         self._waiting = True
         self.clock += self.parameters.cycle_s

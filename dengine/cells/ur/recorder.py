@@ -230,8 +230,9 @@ class RtdeRecorder(AbstractContextManager["RtdeRecorder"]):
             [[row.values[c] for c in self._columns] for row in rows], dtype=np.float64
         )
         values = values.reshape(len(rows), len(self._columns))
-        times = [row.timestamp for row in rows]
-        trace, n_missing = place(times, values, first, self.spec.samples, self._step)
+        trace, n_missing = place(
+            [row.timestamp for row in rows], values, first, self.spec.samples, self._step
+        )
         trace = trace[0] if len(self._columns) == 1 else trace
         return InsertionRecord(trace, n_missing, reconnects)
 

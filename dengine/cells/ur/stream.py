@@ -88,9 +88,10 @@ class RtdeClient:
                     f"Expected RTDE protocol version {VERSION} at {self.where}, "
                     "which refuses it; update it."
                 )
-            rate = struct.pack(">d", rate_hz)
             self._outputs = read_recipe(
-                self._request(PackageType.OUTPUTS, rate + ",".join(outputs).encode()),
+                self._request(
+                    PackageType.OUTPUTS, struct.pack(">d", rate_hz) + ",".join(outputs).encode()
+                ),
                 outputs,
                 "output",
             )
