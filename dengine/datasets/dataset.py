@@ -165,22 +165,22 @@ class Dataset:
         Its columns are `label`, `part` and `cause` if known, and one for each sample of each
         channel: `FZ_0`, `FZ_1`, ... Without channel names they are `x_0`, `x_1`, ... or, if there
         are several channels, `x0_0`, `x0_1`, ... Its metadata (`attrs`, under "dengine") has the
-        fields `channels`, `rate_hz`, `unit`, `limit` and `fit` and the number of channels, so that
-        `load_dataset` reads what `data.to_frame().to_parquet("data.parquet")` writes, without a
-        description. All other fields are lost. The frame may share its memory with X.
+        fields `channels`, `rate_hz`, `unit`, `limit` and `fit`, the number of channels and the
+        names of the columns of samples. So `load_dataset` reads what
+        `data.to_frame().to_parquet("data.parquet")` writes, without a description, also if columns
+        were added or moved. All other fields are lost. The frame may share its memory with X.
         """
         import pandas as pd
 
         _, channels, samples = self.cube.shape
         stems = self.channels or (["x"] if channels == 1 else [f"x{c}" for c in range(channels)])
-        frame = pd.DataFrame(
-            self.X.reshape(len(self), -1),
-            columns=[f"{stem}_{i}" for stem in stems for i in range(samples)],
-        )
+        names = [f"{stem}_{i}" for stem in stems for i in range(samples)]
+        frame = pd.DataFrame(self.X.reshape(len(self), -1), columns=names)
         for name, values in (("cause", self.cause), ("part", self.part), ("label", self.y)):
             if values is not None:
                 frame.insert(0, name, values)
-        frame.attrs[OWN] = {name: getattr(self, name) for name in ABOUT} | {"n_channels": channels}
+        frame.attrs[OWN] = {name: getattr(self, name) for name in ABOUT}
+        frame.attrs[OWN] |= {"n_channels": channels, "columns": names}
         return frame
 
     def select(self, channels: Names) -> "Dataset":

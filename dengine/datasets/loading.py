@@ -247,14 +247,13 @@ def _read_own_table(path: Path) -> Dataset:
 def _from_own_frame(frame: Any, name: str = "table") -> Dataset:
     """Return the data set of a DataFrame that `Dataset.to_frame` made; `name` becomes its name.
 
-    All columns but label, part and cause are samples; each channel gets an equal share of them, in
-    order. Raises DataError if `make_dataset` refuses its arrays, if it has no row or no longer a
-    column `label`, if columns of samples are no numbers, or if their number is no multiple of the
-    number of channels in `attrs`. Other columns that were added or removed are not noticed.
+    The columns of samples are those that `to_frame` wrote; other columns, beside label, part and
+    cause, are ignored. Raises DataError if `make_dataset` refuses its arrays, if it has no row or
+    lacks a column of samples or `label`, or if samples are no numbers.
     """
     about = {**frame.attrs[OWN]}
     words = frame[frame.columns.intersection(["part", "cause"])].astype(str)
-    X = frame.drop(columns=["label", *words]).to_numpy(np.float32)
+    X = frame[about.pop("columns")].to_numpy(np.float32)
     X = X.reshape(len(X), about.pop("n_channels"), -1)
     about |= {key: words[key].to_numpy(np.str_) for key in words}
     return make_dataset(X, frame["label"], name=name, **about)

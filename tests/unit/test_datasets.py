@@ -86,11 +86,15 @@ def test_selected_channels_are_some_and_keep_their_units(make_data):
 
 
 @pytest.mark.parametrize("channels", [1, 2])
-def test_a_frame_of_a_data_set_writes_parquet_that_loads_as_it(make_data, channels, tmp_path):
+def test_a_frame_of_a_data_set_writes_parquet_that_loads_as_it_also_with_columns_added_and_moved(
+    make_data, channels, tmp_path
+):
     parts = np.array([f"P{i // 2}" for i in range(8)])
     names = ("FX", "FZ")[:channels]
     data = replace(make_data(8, samples=30, channels=channels), part=parts, channels=names)
-    data.to_frame().to_parquet(tmp_path / "data.parquet")
+    frame = data.to_frame().sort_index(axis=1)
+    frame["temperature"] = 21.5
+    frame.to_parquet(tmp_path / "data.parquet")
     loaded = load_dataset(tmp_path / "data.parquet", channels=names)
     for name in ("X", "y", "part"):
         np.testing.assert_array_equal(getattr(loaded, name), getattr(data, name))

@@ -200,8 +200,9 @@ def read_tables(p: Proposal) -> list[Table]:
     At most 60 files are read, spread evenly over all, and no further file once 2 MB were read. Of
     text files only those count whose form is the most frequent: the keys of `[text]` are set in `p`
     first. Text files of another form move from `p.names` to `p.others`, and `exclude` may be set
-    to `?` (`propose_form`). Tables with other column names than the most frequent ones, of equal
-    ones the first, are left out, and so are damaged files. `p.is_cut` is set if only the beginning
+    to `?` (`propose_form`). Tables with other column names than the most frequent ones, of equally
+    frequent ones those of the largest table, are left out (Parquet files of such tables move to
+    `p.others`), and so are damaged files. `p.is_cut` is set if only the beginning
     of a file is used. Raises DataError if no file can be read, also because the package that reads
     such files is missing.
     """

@@ -150,7 +150,8 @@ class Column:
 
         Only those in `FORMS` are tried; the list is empty if none fits, for example because a cell
         is empty. The first 20 cells and the last cell of each recording are looked at. If an ISO
-        date fits, with or without a time of day, it is the only form. A column of datetimes has
+        date fits, with or without a time of day, it is the only form. Of two forms that differ by a
+        fraction of a second only the one without it counts. A column of datetimes has
         only the form `iso`. Raises UnreadableError if cells are lists.
         """
         if self.tables[0].columns[self.name].dtype.kind == "M":

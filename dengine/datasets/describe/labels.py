@@ -266,9 +266,9 @@ def propose_label(p: Proposal) -> None:
     the label, unless another source contradicts it: good by one, bad by the other. If none is
     certain, but only one is named like a verdict or stated, this source becomes the label. Its
     `good` or `bad` is `?` if none of its words is known to mean that; a word of unknown meaning is
-    in neither list. But if it has only known words, like "ok", it becomes the label only if there
-    is no other source. Sources that have the same word for each recording count as one here, and
-    the first that is named like a verdict is used. Otherwise `label.column` is `?`, with a note
+    in neither list. But if any source has only known words, like "ok", it becomes the label only if
+    there is no other source. Sources that have the same word for each recording count as one here,
+    and the first that is named like a verdict is used. Otherwise `label.column` is `?`, with a note
     that lists all sources. Further certain sources that have a word for each recording of the label
     become checks, unless checks are stated; a note counts the words of the label, also on
     `label.good` and `label.bad` if these are `?`. Raises DataError if a stated source has no words

@@ -30,11 +30,13 @@ def layout_of(p: Proposal, files: Tables) -> str:
     `files` has the table of each file that is looked at. These rules come one after another.
     A part is a workpiece.
     Several JSON or .ts files, of which the first has one row, are `files`, unless this row has 20
-    or more columns like `x0`, `x1`. Such columns, or lists of two items or more in the first row of
+    or more columns like `x0`, `x1`. Such columns (unless an even clock stands beside them, see
+    `has_even_clock`), or lists of two items or more in the first row of
     the first table, make it `wide`, or `npz` for an .npz file. It is `long` if a column of the
     first table may tell the parts apart (`may_tell_parts`), or if a file has several words of a
     stated `part.column`; unless it is stated, `part.column` is then set in `p` to the only such
-    column with a name like that of a part's number and no word in two files, or to `?` with a note;
+    column with a name like that of a part's number, no word in two files, and at least a quarter as
+    many runs of one word as any such column has, or to `?` with a note;
     this clears `part.path` and `part.line`, also stated ones. Several files, of which `p.names` may
     have more than were looked at, are `files`. A single one gives `?`, with a note on what to
     state. Raises DataError if the lists in 8 rows or more have fewer than 8 items, like the vectors

@@ -220,7 +220,8 @@ def propose_channels(p: Proposal, units: Mapping[str, str]) -> None:
     """Set `[channels]` in `p` to one column, with its unit; does nothing if channels are stated.
 
     The rules are tried in order, and the first that any column fits decides: a name like a force
-    along z, a name like a force, a unit of force or torque, a name like `F` or `value`, any column.
+    along z; a name like a force, a unit of force or torque, or a name like `F` or `value`; any
+    column.
     A name decides only if the unit is that of a force or torque, or unknown. The channels stay
     empty, with a note, if `units` is empty, if several columns fit the rule, if the column that
     fits has no unit of force or torque and another column has one, if one of these columns is named
@@ -377,12 +378,14 @@ def propose_order(p: Proposal) -> None:
 
     That is so if the files of the folders, one folder after the other, have another order, with the
     text of `label.path` and folders named like a verdict left out (not looked at while
-    `label.column` is `?`); if a file name has a date with the day or the month first, the
-    month as a word, or AM or PM, by which names do not sort; if the names are not in the order of
-    their dates; or if a column of `p.unused` has one word (text of a cell) per recording, which is
-    a date or time or whose name says so (`timestamp`, `created`), and these, as `natural_key`
-    sorts texts, are in another order. If several of these hold, the note is on the last. An `order`
-    that the user stated stays. Raises SettingError for a malformed `windows.trigger`.
+    `label.column` is `?`), or if two folders have a file of one name; if a file name has a date
+    with the day or the month first, the month as a word, or AM or PM, by which names do not sort;
+    if the names are not in the order of their dates; if all names have random numbers (UUIDs); if
+    the part numbers are sorted as texts (P10 before P2); or if a column of `p.unused` has one word
+    (text of a cell) per recording, which is a date or time or whose name says so (`timestamp`,
+    `created`), and these, as `natural_key` sorts texts, are in another order. If several of these
+    hold, the note is on the last. An `order` that the user stated stays. Raises SettingError for a
+    malformed `windows.trigger`.
     """
     paths = [without_label(p.description.label, without_suffix(name)) for name in p.names]
     names = sorted((path.rpartition("/")[2] for path in paths), key=natural_key)

@@ -74,8 +74,8 @@ def look(content: bytes, stated: Stated) -> Look:
     DataError if it is empty or no text, or if the line of its header is not certain, and
     LookupError for a stated encoding that Python does not know.
 
-    stated : keys that the user gave. `text.encoding` and `text.delimiter` are taken; `text.header`
-    only says that a doubt about the header is no error.
+    stated : keys that the user gave. `text.encoding` and `text.delimiter` are taken, and so is
+    `text.header` if it is a text; a number only says that a doubt about the header is no error.
     """
     encoding, text = decode(content, stated.get("text.encoding", ""))
     lines = text.rstrip("\n").split("\n")
@@ -158,7 +158,7 @@ def _first_row(rows: Rows, width: int) -> int:
 def is_numbering(cells: Sequence[str]) -> bool:
     """Return whether 20 cells or more are numbers, and all these rise; other cells are ignored.
 
-    They rise as `natural_key` sorts texts: 9, 10, but not 0.25, 0.5 or -2, -1.
+    They rise in equal steps, or as `natural_key` sorts texts: 9, 10, 12, but not 0.25, 0.5, 1.5.
     """
     numbers = [*filter(NUMBER.fullmatch, cells)]
     if len(numbers) < MOST_NAMES:
@@ -218,12 +218,12 @@ def propose_form(p: Proposal, contents: Mapping[str, bytes], faults: list[Fault]
 
     Files with another delimiter, number of columns or header are left out: they move from `p.names`
     to `p.others`. If two or more of them have at least 8 rows of samples, or if a single one has,
-    and its name differs by a number only from that of a file in the result, `exclude` is set to
-    `?` (the user must answer), with a note that asks whether they are recordings. For a file that
-    is no text, or whose header is not certain, a fault is appended to `faults`, and it stays in
+    and its name differs by a number only from that of a file in the result, `exclude` is set to `?`
+    (the user must answer), with a note that asks whether they are recordings. For a file that is no
+    text, or whose header is not certain, a fault is appended to `faults`, and it stays in
     `p.names`; if all are such, nothing is set, and the result is empty. Of equally frequent forms
-    the first counts. Keys that the user stated stay. Raises LookupError for a stated encoding that
-    Python does not know.
+    that of the file with the most cells counts. Keys that the user stated stay. Raises LookupError
+    for a stated encoding that Python does not know.
 
     contents : the contents of the files that are looked at, by name.
     """
@@ -277,13 +277,13 @@ def _propose_keys(p: Proposal, looks: Sequence[Look]) -> None:
 def _column_names(usual: Look) -> Sequence[str]:
     """Return the names for `text.names`; empty if the header names each column.
 
-    `#` or `%` at the beginning of the header is skipped. If the header has only empty cells beyond
-    the last column, the names are those of the header. If it lacks the last column, and this is
-    empty in all rows, the names are those of the header and one like `column3`. Without a header,
-    or if it has another number of cells, the names are `c0`, `c1`, ...; for 20 columns or more it
-    is `x*`, which names all of them. Such a table may have a part in each row: if its first column
-    has 2 to 12 different words, all whole numbers, and the second column has more different words,
-    the first is named `class`, before `x*`.
+    `#` or `%` at the beginning of the header is skipped. If the header has more cells than there
+    are columns, the first are the names; but if the delimiter is a blank, only if the others are
+    empty. If it lacks the last column, and this is empty in all rows, the names are those of the
+    header and one like `column3`. Without a header, or if it has another number of cells, the names
+    are `c0`, `c1`, ...; for 20 columns or more it is `x*`, which names all of them. Such a table
+    may have a part in each row: if its first column has 2 to 12 different words, all whole numbers,
+    and the second column has more different words, the first is named `class`, before `x*`.
 
     usual : how a typical file is written, and the cells of its samples.
     """

@@ -210,7 +210,8 @@ def _read_plain(
 def _read_strictly(content: bytes, table: Table, form: TextForm) -> Table:
     """Return the table with all cells as texts, without empty and dropped lines.
 
-    A line that has only blanks or tabs is empty, too, also if a tab is the delimiter.
+    A line that has only blanks or tabs is empty, too, also if a tab is the delimiter. So are lines
+    that have only delimiters at the end of the file.
 
     `content` is as `to_utf8` returns it. Of `table` the names of the columns and the first line
     number are read: reading begins at this line. Lines that begin with a text of `form.drop` are
