@@ -211,10 +211,11 @@ def propose_rate(p: Proposal, tables: Tables) -> None:
     the rate and the gap that the description has by then. If it refuses more recordings than 10 %
     plus one, `time.gap` is set to `?`, with a note on the first. If `traces.lengths` is stated as
     `resample`, `traces.samples` becomes as many as 99 % of the recordings last; longer ones lose
-    their end when they are read. If all recordings start after 1999
-    (UTC), `order` is set to `time`, also if the rate is `?`. Recordings whose times cannot be read
-    are skipped. Stated keys stay. Raises DataError if a stated format is no form or unit of times,
-    or if a setting in `[time]` is wrong (see `check_forms`).
+    their end when they are read. If all recordings start after 1999 (UTC), `order` is set to
+    `time`, also if the rate is `?`; if they do not, but one clock runs on through all of them, and
+    its order is another one, `order` is `?`. Recordings whose times cannot be read are skipped.
+    Stated keys stay. Raises DataError if a stated format is no form or unit of times, or if a
+    setting in `[time]` is wrong (see `check_forms`).
     """
     clock = p.description.time
     check_forms(clock, TextForm())  # the marks in numbers may be ? by now
