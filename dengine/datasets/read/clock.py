@@ -110,7 +110,8 @@ def _dates(table: Table, name: str, unit: str, clock: Clock) -> Floats:
     """Return the times in a column of dates or times of day.
 
     They are in seconds since 1970 (UTC), or since midnight if the cells have no date. `unit` is the
-    form of the cells, "iso" or like "%d.%m.%Y"; a comma is read as a point. Dates without a time
+    form of the cells, "iso" or like "%d.%m.%Y"; a comma is read as a point, and the fraction of a
+    second may lack. Dates without a time
     zone are in `clock.zone`, or UTC if that is empty; times in the hour that comes twice need rows
     from both, in order. Raises UnreadableError if there is no column `name`, or one of its cells
     does not have the form, or is no single time because clocks are changed, or if the cells have
@@ -123,9 +124,10 @@ def _dates(table: Table, name: str, unit: str, clock: Clock) -> Floats:
     with instead(
         UnreadableError, f"Expected times of the form {unit}", ValueError, AttributeError, re.error
     ):
-        if "%S.%f" in form:  # the fraction may lack in whole seconds
-            texts = texts.str.replace(r"(:\d\d)(?![\d.:])", r"\1.0", regex=True)
         times = pd.to_datetime(texts, format=form, errors="coerce")
+        if times.isna().any():  # the fraction may lack in whole seconds
+            whole = form.replace(".%f", "")
+            times = times.fillna(pd.to_datetime(texts, format=whole, errors="coerce"))
         if times.dt.tz is None:
             zone = (has_day(unit) and clock.zone) or "UTC"
             times = times.dt.tz_localize(zone, ambiguous="infer")
