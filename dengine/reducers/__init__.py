@@ -62,15 +62,17 @@ def reducer_class(name: str) -> type:
         If there is no such class, its module cannot be imported, or it is no scikit-learn
         transformer.
     """
-    expected = f"a reducer among {', '.join(_NAMED)}, or module:Class of your own"
-    expect(name in _NAMED or ":" in name, expected, name)
+    expect(
+        name in _NAMED or ":" in name,
+        f"a reducer among {', '.join(_NAMED)}, or module:Class of your own",
+        name,
+    )
     cls: type = __getattr__(_NAMED[name][1]) if name in _NAMED else import_class(name)
     missing = [method for method in TRANSFORMER_METHODS if not callable(getattr(cls, method, None))]
     if missing:
-        actual = f"{name} has no {' and no '.join(missing)}"
         raise SettingError(
             "Expected a scikit-learn transformer as reducer, for a network a TorchReducer, "
-            f"{actual}."
+            f"{name} has no {' and no '.join(missing)}."
         )
     return cls
 
@@ -103,8 +105,9 @@ def make_reducer(name: str, **params: Any) -> Any:
     allowed = signature(cls).parameters
     unknown = sorted(set(params) - set(allowed))
     if unknown:
-        problem = f"{cls.__name__} has no parameter {', '.join(unknown)}"
-        raise SettingError(f"{problem}; it has {', '.join(allowed)}.")
+        raise SettingError(
+            f"{cls.__name__} has no parameter {', '.join(unknown)}; it has {', '.join(allowed)}."
+        )
     if name in _NAMED:
         for key, value in params.items():
             _check_parameter(allowed[key].default, key, value)

@@ -368,9 +368,13 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
             )
         if reset:
             largest = float(max(traces.max(), -traces.min()))
-            do = "check the sensor, or use a smaller unit"
-            is_usual = largest >= SMALLEST or largest == 0.0
-            expect(is_usual, f"samples of {SMALLEST} at least", largest, do, TraceError)
+            expect(
+                largest >= SMALLEST or largest == 0.0,
+                f"samples of {SMALLEST} at least",
+                largest,
+                "check the sensor, or use a smaller unit",
+                TraceError,
+            )
             self.trace_shape_ = traces.shape[1:]
         elif traces.shape[1:] != self.trace_shape_:
             expected = "{} channels x {} samples".format(*self.trace_shape_)
@@ -466,8 +470,7 @@ def points_in_fold_space(Z: Floats, folds: Ints) -> Floats:
     If there is a single space, all points are in it, and `folds` is not read. The result is a
     contiguous copy.
     """
-    spaces = np.asarray(folds) if Z.shape[1] > 1 else np.zeros(len(Z), dtype=np.int64)
-    return np.ascontiguousarray(Z[np.arange(len(Z)), spaces])
+    return np.ascontiguousarray(Z[np.arange(len(Z)), folds if Z.shape[1] > 1 else 0])
 
 
 def space_scale(points: Floats, folds: Ints, n_spaces: int) -> Floats:
@@ -541,14 +544,13 @@ def binary_labels(y: Any, n: int, name: str) -> Ints:
             f"{name} uses labels: requires y to be passed, but the target y is None."
         )
     try:
-        labels = column_or_1d(y, warn=True)
+        labels = np.asarray(column_or_1d(y, warn=True))
         assert_all_finite(labels, input_name="y")
         classes = classes_of(labels)
     except (
         ValueError
     ) as error:  # scikit-learn's words for one that is continuous, not finite or not one column
         raise SettingError(str(error)) from error
-    labels = np.asarray(labels)
     if len(labels) != n:
         raise SettingError(
             f"Expected a label for each of {n} traces, "
@@ -569,8 +571,11 @@ def folds_of(traces: Floats, n_folds: int, folds: Any = None) -> Ints:
     if folds is None:
         return content_fold(traces, n_folds)
     given = np.asarray(folds, dtype=np.int64)
-    within = given.shape == (len(traces),) and set(range(n_folds)).issuperset(given)
-    expect(within, f"{len(traces)} folds from 0 to {n_folds - 1}", given)
+    expect(
+        given.shape == (len(traces),) and set(range(n_folds)).issuperset(given),
+        f"{len(traces)} folds from 0 to {n_folds - 1}",
+        given,
+    )
     return given
 
 
@@ -605,8 +610,9 @@ def draw_seed(random_state: Any) -> int:
     """
     if isinstance(random_state, int | np.integer):
         return int(random_state)
-    expected = "Expected random_state None, an integer or a RandomState"
-    with instead(SettingError, expected, ValueError):
+    with instead(
+        SettingError, "Expected random_state None, an integer or a RandomState", ValueError
+    ):
         return int(check_random_state(random_state).randint(2**31 - 1))
 
 
@@ -682,8 +688,7 @@ class LabelFree(_Wrapping):
         (n, C * T). Returns self. `trace_shape_` and `n_features_in_` are set, too. Raises what
         `check_traces` and the transformer raise.
         """
-        traces = self.check_traces(X, reset=True)
-        self.reducer_ = clone(self.reducer).fit(self.as_input(traces))
+        self.reducer_ = clone(self.reducer).fit(self.as_input(self.check_traces(X, reset=True)))
         return self
 
     def transform(self, X: ArrayLike) -> Floats:

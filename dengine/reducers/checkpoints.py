@@ -50,9 +50,12 @@ def load_checkpoint(members: Members, path: str | Path) -> None:
     }
     fits = {name: value.shape for name, value in weights.items()} == shapes
     is_finite = all(bool(value.isfinite().all()) for value in weights.values())
-    wanted = "finite weights of this network, for traces of this many channels"
-    do = "train it and write them with save_checkpoint"
-    expect(fits and is_finite, wanted, f"others in {path}", do)
+    expect(
+        fits and is_finite,
+        "finite weights of this network, for traces of this many channels",
+        f"others in {path}",
+        "train it and write them with save_checkpoint",
+    )
     with torch.no_grad():
         for name, value in state.items():
             weight = weights[names[name]]

@@ -111,16 +111,19 @@ def conv_layers(
     The convolution has `groups` groups, which it keeps apart; `inputs` and `outputs` are channels
     of each group. It has no bias and pads `kernel` // 2 zeros at both ends.
     """
-    convolution = nn.Conv1d(
-        groups * inputs,
-        groups * outputs,
-        kernel,
-        stride,
-        padding=kernel // 2,
-        groups=groups,
-        bias=False,
-    )
-    return [convolution, nn.BatchNorm1d(groups * outputs), nn.ReLU()]
+    return [
+        nn.Conv1d(
+            groups * inputs,
+            groups * outputs,
+            kernel,
+            stride,
+            padding=kernel // 2,
+            groups=groups,
+            bias=False,
+        ),
+        nn.BatchNorm1d(groups * outputs),
+        nn.ReLU(),
+    ]
 
 
 class ConvEncoder(nn.Module):
@@ -256,8 +259,9 @@ class ConvReducer(TorchReducer):
         Raises as `TorchReducer.embed` does.
         """
         traces = self.check_traces(X)  # once, since `rocket_` knows no names of columns
-        points = torch.from_numpy(super().embed(traces))
-        return average_logits(points, torch.from_numpy(self.rocket_.embed(traces))).numpy()
+        return average_logits(
+            torch.from_numpy(super().embed(traces)), torch.from_numpy(self.rocket_.embed(traces))
+        ).numpy()
 
     def module(self) -> ConvEncoder:
         """Return a new module that embeds, (B, C, T) -> (B, K, d), in evaluation mode.
@@ -274,8 +278,9 @@ class ConvReducer(TorchReducer):
         The names of the latter begin with "rocket.". `set_state` restores the reducer from them bit
         for bit. Raises NotFittedError before a fit, AttributeError before the first training.
         """
-        rocket = {f"rocket.{name}": value for name, value in self.rocket_.get_state().items()}
-        return super().get_state() | rocket
+        return super().get_state() | {
+            f"rocket.{name}": value for name, value in self.rocket_.get_state().items()
+        }
 
     def set_state(self, state: Arrays) -> Self:
         """Restore what `get_state` returned, `rocket_` included; return self.

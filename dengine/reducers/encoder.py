@@ -56,9 +56,12 @@ class Members(nn.Module):
     def __init__(self, network: NetworkFactory, channels: int, samples: int, count: int) -> None:
         super().__init__()
         self.count = count
-        is_factory = callable(network) and not isinstance(network, nn.Module)
-        wanted = "network to be a class or function that returns a module"
-        expect(is_factory, wanted, f"an instance of {type(network).__name__}", "pass its class")
+        expect(
+            callable(network) and not isinstance(network, nn.Module),
+            "network to be a class or function that returns a module",
+            f"an instance of {type(network).__name__}",
+            "pass its class",
+        )
         grouped = "members" in signature(network).parameters
         shape = f"(B, {channels}, {samples}) to (B, features)"
         if grouped:
@@ -72,10 +75,12 @@ class Members(nn.Module):
             features = count_features(self.networks, count, channels, samples)
             register_tensors(self.networks)
         if isinstance(self.networks, Separate):
-            n_of_members = sum(map(count_trained, self.networks.networks))
-            wanted = "a network for each member, with weights of its own"
-            is_apart = count_trained(self.networks) == n_of_members
-            expect(is_apart, wanted, "one that shares them", "make new layers in each call")
+            expect(
+                count_trained(self.networks) == sum(map(count_trained, self.networks.networks)),
+                "a network for each member, with weights of its own",
+                "one that shares them",
+                "make new layers in each call",
+            )
         bound = features**-0.5
         self.weight = nn.Parameter(torch.empty(count, features, 2).uniform_(-bound, bound))
         self.bias = nn.Parameter(torch.zeros(count, 2))

@@ -83,9 +83,7 @@ class RidgeProblem:
         It is the sum of log losses over the rows that train the head, plus half the ridge times the
         square of each weight.
         """
-        logits = w @ self.g.T
-        losses = summed_loss(logits, self.y, self.mask)
-        return losses + 0.5 * (self.ridge * w * w).sum(1)
+        return summed_loss(w @ self.g.T, self.y, self.mask) + 0.5 * (self.ridge * w * w).sum(1)
 
     def gradient(self, w: Tensor, p: Tensor) -> Tensor:
         """Compute the gradient of `objective` at heads w (K, W + 1): (K, W + 1).
@@ -181,8 +179,7 @@ def fit_heads(
         p = torch.sigmoid(w @ problem.g.T)
         for k in stale.nonzero().flatten().tolist():
             factors[k] = problem.cholesky_of_hessian(k, p[k])
-        gradient = problem.gradient(w, p)
-        change = torch.cholesky_solve(gradient[..., None], factors)[..., 0]
+        change = torch.cholesky_solve(problem.gradient(w, p)[..., None], factors)[..., 0]
         change[converged] = 0.0
         for _ in range(HALVINGS):
             new_loss = problem.objective(w - change)

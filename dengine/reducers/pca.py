@@ -65,11 +65,11 @@ class PcaReducer(Reducer):
             for a parameter that scikit-learn refuses, such as `n_components=0`.
         """
         rows = as_rows(self.check_traces(X, reset=True))
-        largest = min(len(rows) - 1, rows.shape[1])
-        if self.n_components > largest:
-            needs = f"PCA needs more than {self.n_components} traces, and as many samples"
-            actual = f"n_samples = {len(rows)}, n_features = {rows.shape[1]}"
-            raise SettingError(f"{needs}, got {actual}.")
+        if self.n_components > min(len(rows) - 1, rows.shape[1]):
+            raise SettingError(
+                f"PCA needs more than {self.n_components} traces, and as many samples, got "
+                f"n_samples = {len(rows)}, n_features = {rows.shape[1]}."
+            )
         pca = PCA(self.n_components, svd_solver="randomized", random_state=self.random_state)
         pca.fit(rows)
         self.mean_ = pca.mean_.astype(np.float32)

@@ -113,6 +113,6 @@ def averaging(traces: Tensor, min_frames: int = MIN_FRAMES) -> int:
         n_means = samples // average
         used = centred[:, :, samples - n_means * average :]
         means = used.reshape(len(traces), -1, n_means, average).mean(3)
-        if bool((means.square().mean((0, 2)) >= MIN_EXPLAINED_VARIANCE * variance).all()):
+        if (means.square().mean((0, 2)) >= MIN_EXPLAINED_VARIANCE * variance).all():
             return average
     return 1

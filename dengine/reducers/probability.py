@@ -112,8 +112,12 @@ class ProbabilityReducer(Reducer):
         `_initialize` raises. Raises the errors of `check_traces`.
         """
         if not self.is_initialized_:
-            do = "verify more parts first"
-            expect(len(X) >= MIN_TRACES, f"at least {MIN_TRACES} traces", len(X), do)
+            expect(
+                len(X) >= MIN_TRACES,
+                f"at least {MIN_TRACES} traces",
+                len(X),
+                "verify more parts first",
+            )
             self._initialize(self.check_traces(X, reset=True))
         return self.check_traces(X)
 

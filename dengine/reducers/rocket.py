@@ -205,9 +205,8 @@ class Tower(NamedTuple):
         They give the same logits on the tower's features as `w` on its components.
         """
         w = self.w[:, :-1]
-        bias = self.w[:, -1]
         weights = (self.axes.double() @ w.T).float()
-        return weights, (bias + w @ self.centre.double()).float()
+        return weights, (self.w[:, -1] + w @ self.centre.double()).float()
 
 
 def weigh_towers(
@@ -240,12 +239,11 @@ def weigh_towers(
     losses : Tensor of float64, shape (K,)
         Leave-one-out log loss of the mixed logit k over the rows outside fold k, in nats per row.
     """
-    n_heads = len(outside)
     n_rows = outside.sum(1)
     mask = outside.double()
     kept_shares = torch.linspace(0.0, 1.0, N_SHARES).double()
     mixed = left_out[0]
-    shares = [torch.ones(n_heads)]
+    shares = [torch.ones(len(outside))]
     for logits, penalty in zip(left_out[1:], penalties[1:], strict=True):
         losses = masked_loss(logits + kept_shares[:, None, None] * (mixed - logits), y, mask)
         penalised = losses + penalty * (1.0 - kept_shares)[:, None] / n_rows
@@ -337,8 +335,9 @@ class RocketReducer(ProbabilityReducer):
         traces outside a fold have a single class, and at the first call for a parameter out of its
         range or fewer than 2 samples.
         """
-        do = "verify more parts first"
-        expect(len(X) >= MIN_TRACES, f"at least {MIN_TRACES} traces", len(X), do)
+        expect(
+            len(X) >= MIN_TRACES, f"at least {MIN_TRACES} traces", len(X), "verify more parts first"
+        )
         traces = self._check_and_initialize(X)
         check_classes(y, self.training_masks(folds))
         return self.train_heads(traces, y, folds, stop or StopRule(), numbers)
@@ -378,8 +377,12 @@ class RocketReducer(ProbabilityReducer):
             self.regions,
             self.groups,
         )
-        n_leading = min(N_LEADING, self.width, encoder.towers[0].stop)
-        self.net_ = FeatureEmbedding(encoder, self.folds, self.n_components, n_leading).eval()
+        self.net_ = FeatureEmbedding(
+            encoder,
+            self.folds,
+            self.n_components,
+            min(N_LEADING, self.width, encoder.towers[0].stop),
+        ).eval()
         self.is_initialized_ = False  # until kernels are drawn or restored
         self.n_fits_ = 0
         self.n_component_traces_ = 0
@@ -411,21 +414,29 @@ class RocketReducer(ProbabilityReducer):
         """
         raw = self.raw_features(traces, numbers)
         with torch.no_grad():
-            grew = len(raw) >= GROWTH * self.n_component_traces_
-            if grew or self.n_fits_ % REFRESH_EVERY == 0:
+            if len(raw) >= GROWTH * self.n_component_traces_ or self.n_fits_ % REFRESH_EVERY == 0:
                 self._compute_components(raw)
             min_steps = 0 if self.n_fits_ else MIN_FIRST_STEPS
             rows = sample_rows(len(raw), numbers)
             f = self.net_.encoder.scale_features(raw[rows])
             y = torch.from_numpy(labels[rows])
             outside = torch.from_numpy(self.training_masks(folds[rows]))
-            fits = []
-            for tower, features in zip(self.towers_, self._tower_features(f), strict=True):
-                g = tower.components(features)
-                fit = fit_heads(g, y, outside, tower.w, self.l2, self.max_iter, stop, min_steps)
-                fits.append(fit)
-            pairs = zip(self.towers_, fits, strict=True)
-            self.towers_ = [tower._replace(w=fit.w) for tower, fit in pairs]
+            fits = [
+                fit_heads(
+                    tower.components(features),
+                    y,
+                    outside,
+                    tower.w,
+                    self.l2,
+                    self.max_iter,
+                    stop,
+                    min_steps,
+                )
+                for tower, features in zip(self.towers_, self._tower_features(f), strict=True)
+            ]
+            self.towers_ = [
+                tower._replace(w=fit.w) for tower, fit in zip(self.towers_, fits, strict=True)
+            ]
             penalties = [0.0] * (len(fits) - 1) + [PRODUCT_PENALTY]
             shares, losses = weigh_towers([fit.left_out for fit in fits], penalties, y, outside)
             self._set_heads(shares)
@@ -509,11 +520,14 @@ class RocketReducer(ProbabilityReducer):
                     f[:, columns], self.width, TOWER_VARIANCES[i], weights, mean_logits
                 )
             )
-        products = self._tower_features(f)[-1]
-        no_weights = torch.zeros(net.n_leading**2, self.folds)
-        no_logits = torch.zeros(self.folds)
         self.towers_.append(
-            Tower.from_features(products, self.width, PRODUCT_VARIANCE, no_weights, no_logits)
+            Tower.from_features(
+                self._tower_features(f)[-1],
+                self.width,
+                PRODUCT_VARIANCE,
+                torch.zeros(net.n_leading**2, self.folds),
+                torch.zeros(self.folds),
+            )
         )
         self._set_axes(f[:, encoder.towers[0]])
 
@@ -548,12 +562,11 @@ class RocketReducer(ProbabilityReducer):
         tensor that is returned shares its memory. Without numbers the cache is neither read nor
         written.
         """
-        encoder = self.net_.encoder
         with torch.no_grad():
             return torch.from_numpy(
                 self._raw.update(
                     numbers,
-                    lambda index: compute_raw_features(encoder, traces[index]).numpy(),
+                    lambda index: compute_raw_features(self.net_.encoder, traces[index]).numpy(),
                 )
             )
 
@@ -598,10 +611,11 @@ class RocketReducer(ProbabilityReducer):
         the first fit.
         """
         check_is_fitted(self, "net_")
-        counts = [self.average_, self.n_fits_, self.n_component_traces_, self.n_iter_]
         state = {
             "shape": np.array(self.trace_shape_),
-            "counts": np.array(counts),
+            "counts": np.array(
+                [self.average_, self.n_fits_, self.n_component_traces_, self.n_iter_]
+            ),
             "losses": self.holdout_losses_,
         }
         for i, tower in enumerate(self.towers_):

@@ -102,8 +102,9 @@ class RocketEncoder(nn.Module):
     ) -> None:
         super().__init__()
         if samples < 2:
-            actual = f"{samples} (n_features = {channels * samples})"
-            raise SettingError(f"Expected at least 2 samples, got {actual}.")
+            raise SettingError(
+                f"Expected at least 2 samples, got {samples} (n_features = {channels * samples})."
+            )
         frames = samples // average
         places = max(1, min(frames, MAX_PLACES[0]) // regions) * regions
         sparse_places = min(frames, MAX_PLACES[1])
@@ -315,8 +316,9 @@ class RocketEncoder(nn.Module):
             answers = (kernels @ windows).numpy()
             of_dilation = quantiles[d * self.n_kernels : (d + 1) * self.n_kernels]
             ranks = (of_dilation * (answers.shape[1] - 1)).astype(np.int64)
-            pairs = zip(answers, ranks, strict=True)
-            thresholds = [np.partition(row, rank)[rank] for row, rank in pairs]
+            thresholds = [
+                np.partition(row, rank)[rank] for row, rank in zip(answers, ranks, strict=True)
+            ]
             slope = 1.0 / (2.0 * torch.from_numpy(answers.std(1)) + 1e-6)  # two deviations wide
             self.kernel[d] = kernels * slope[:, None]
             self.threshold[d, :, 0] = 0.5 - torch.tensor(thresholds) * slope
@@ -325,8 +327,9 @@ class RocketEncoder(nn.Module):
             for d, windows in enumerate(sparse):  # (C * 9, Q * n)
                 weights = rng.standard_normal((self.competing_kernel.size(1), TAPS))
                 weights -= weights.mean(1, keepdims=True)  # so that offsets do not matter
-                choices = torch.from_numpy(weights).float()
-                kernels = draw_kernels(x.size(1), len(weights), choices, rng)
+                kernels = draw_kernels(
+                    x.size(1), len(weights), torch.from_numpy(weights).float(), rng
+                )
                 width = COMPETITION_WIDTH * (kernels @ windows).std() + 1e-6
                 self.competing_kernel[d] = kernels / width
 
@@ -394,12 +397,10 @@ def draw_kernels(channels: int, n: int, choices: Tensor, rng: np.random.Generato
     likely. It is the same in all channels that it reads, and 0 in the others. Each row of the
     result has the norm 1.
     """
-    drawn = rng.permutation(max(n, len(choices)))[:n] % len(choices)
-    kernels = choices[torch.from_numpy(drawn)]
+    kernels = choices[torch.from_numpy(rng.permutation(max(n, len(choices)))[:n] % len(choices))]
     weights = torch.zeros(n, channels)
     for row in range(n):
-        order = rng.permutation(channels)
-        selected = order[: int(2.0 ** rng.uniform(0.0, np.log2(channels + 1)))]
+        selected = rng.permutation(channels)[: int(2.0 ** rng.uniform(0.0, np.log2(channels + 1)))]
         weights[row, torch.from_numpy(selected)] = len(selected) ** -0.5
     units = kernels / kernels.square().sum(1, keepdim=True).sqrt()
     return torch.flatten(weights[:, :, None] * units[:, None], 1)

@@ -122,9 +122,7 @@ class Augmentation:
             return x, y
         share = rng.beta(self.mixup, self.mixup, size=(batch, members)).astype(np.float32)
         weight = torch.from_numpy(np.maximum(share, 1.0 - share))
-        other_x = x.roll(1, 0)
-        other_y = y.roll(1, 0)
-        return other_x.lerp(x, weight[:, :, None, None]), other_y.lerp(y, weight)
+        return x.roll(1, 0).lerp(x, weight[:, :, None, None]), y.roll(1, 0).lerp(y, weight)
 
 
 @dataclass(eq=False, repr=False, kw_only=True)
@@ -217,8 +215,9 @@ class TorchReducer(ProbabilityReducer):
         network or checkpoint that cannot be used.
         """
         traces = self._check_and_initialize(X)
-        steps = self.n_steps_due(len(traces))
-        return self._train(traces, y, folds, stop or StopRule(), steps, numbers)
+        return self._train(
+            traces, y, folds, stop or StopRule(), self.n_steps_due(len(traces)), numbers
+        )
 
     def n_steps_due(self, n_labels: int) -> int:
         """Return the number of steps that the next retrain takes on `n_labels` labels.
@@ -269,14 +268,16 @@ class TorchReducer(ProbabilityReducer):
         """
         self.check()
         if samples < 2:
-            actual = f"{samples} (n_features = {channels * samples})"
-            raise SettingError(f"Expected at least 2 samples, got {actual}.")
+            raise SettingError(
+                f"Expected at least 2 samples, got {samples} (n_features = {channels * samples})."
+            )
         self.preprocessor_ = Preprocessor(channels, samples, average)
         self.seed_ = draw_seed(self.random_state) if seed is None else seed
-        shape = self.preprocessor_.channels, self.preprocessor_.samples
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(self.seed_)
-            self.members_ = Members(self.network, *shape, self.folds)
+            self.members_ = Members(
+                self.network, self.preprocessor_.channels, self.preprocessor_.samples, self.folds
+            )
         self.averaged_members_ = copy.deepcopy(self.members_)
         self.optimizer_state_: dict[int, dict[str, Tensor]] = {}
         self.why_no_module_ = None  # until it was tried
@@ -388,8 +389,7 @@ class TorchReducer(ProbabilityReducer):
         before the step, the mean over the batch and over the K copies of the network; each copy
         moves by the gradient of its own mean loss.
         """
-        logits = self.members_(x)  # (B, K)
-        loss = F.binary_cross_entropy_with_logits(logits, y)
+        loss = F.binary_cross_entropy_with_logits(self.members_(x), y)  # of logits (B, K)
         optimizer.zero_grad()
         # Members share no weights, so each gets the gradient of its own mean loss.
         (self.folds * loss).backward()  # type: ignore[no-untyped-call]
@@ -408,11 +408,14 @@ class TorchReducer(ProbabilityReducer):
         parameters: dict[bool, list[nn.Parameter]] = {True: [], False: []}  # by whether they decay
         for name, parameter in self.members_.named_parameters():
             parameters[parameter.dim() > 1 and name.endswith("weight")].append(parameter)
-        groups = [
-            {"params": parameters[True], "weight_decay": self.weight_decay},
-            {"params": parameters[False], "weight_decay": 0.0},
-        ]
-        optimizer = torch.optim.AdamW(groups, lr=self.learning_rate, fused=True)
+        optimizer = torch.optim.AdamW(
+            [
+                {"params": parameters[True], "weight_decay": self.weight_decay},
+                {"params": parameters[False], "weight_decay": 0.0},
+            ],
+            lr=self.learning_rate,
+            fused=True,
+        )
         if self.optimizer_state_:
             optimizer.load_state_dict(optimizer.state_dict() | {"state": self.optimizer_state_})
         return optimizer
@@ -426,8 +429,9 @@ class TorchReducer(ProbabilityReducer):
         Statistics of batch normalisation are not averaged.
         """
         kept = min(self.weight_averaging, (1 + self.n_steps_) / (10 + self.n_steps_))
-        averages = self.averaged_members_.parameters()
-        for average, current in zip(averages, self.members_.parameters(), strict=True):
+        for average, current in zip(
+            self.averaged_members_.parameters(), self.members_.parameters(), strict=True
+        ):
             average.lerp_(current, 1.0 - kept)
 
     @torch.no_grad()
@@ -443,11 +447,11 @@ class TorchReducer(ProbabilityReducer):
         members = self.averaged_members_.eval()
         for buffer, trained in zip(members.buffers(), self.members_.buffers(), strict=True):
             buffer.copy_(trained)
-        norms = [module for module in members.modules() if isinstance(module, _BatchNorm)]
-        for norm in norms:
-            norm.reset_running_stats()
-            norm.momentum = None  # the mean over all batches
-            norm.train()
+        for module in members.modules():
+            if isinstance(module, _BatchNorm):
+                module.reset_running_stats()
+                module.momentum = None  # the mean over all batches
+                module.train()
         rows = np.random.default_rng(len(x)).permutation(len(x))[:STATISTICS_TRACES]
         for chunk in torch.from_numpy(rows).chunk(-(-len(rows) // CHUNK)):
             members(x[chunk, None].expand(-1, self.folds, -1, -1))
@@ -498,9 +502,10 @@ class TorchReducer(ProbabilityReducer):
         NotFittedError before there are networks, and TypeError if `network` is not hashable.
         """
         check_is_fitted(self, "encoder_")
-        shape = self.preprocessor_.channels, self.preprocessor_.samples
         if self.why_no_module_ is None:  # copies of the reducer, which an engine trains, keep it
-            self.why_no_module_ = compile_fault(self.network, *shape)
+            self.why_no_module_ = compile_fault(
+                self.network, self.preprocessor_.channels, self.preprocessor_.samples
+            )
         return None if self.why_no_module_ else self.encoder_
 
     @property
@@ -527,11 +532,17 @@ class TorchReducer(ProbabilityReducer):
         which `set_state` recognises the network. Raises NotFittedError before there are networks.
         """
         check_is_fitted(self, "encoder_")
-        counts = [self.preprocessor_.average, self.seed_, self.n_steps_]
-        counts += [self.n_steps_left_, self.n_new_steps_]
         state = {
             "shape": np.array(self.trace_shape_),
-            "counts": np.array(counts),
+            "counts": np.array(
+                [
+                    self.preprocessor_.average,
+                    self.seed_,
+                    self.n_steps_,
+                    self.n_steps_left_,
+                    self.n_new_steps_,
+                ]
+            ),
             "loss": np.array(self.loss_),
             "points": self._embed_ramp(),
         }
@@ -563,8 +574,7 @@ class TorchReducer(ProbabilityReducer):
             restore(module, module_state(module, "") | arrays_with_prefix(state, name))
         for name, value in arrays_with_prefix(state, "optimizer.").items():
             i, key = name.split(".")
-            moments = self.optimizer_state_.setdefault(int(i), {})
-            moments[key] = torch.from_numpy(np.array(value))
+            self.optimizer_state_.setdefault(int(i), {})[key] = torch.from_numpy(np.array(value))
         self.is_initialized_ = True
         self.encoder_ = self._new_encoder()
         points = state.get("points")
@@ -614,16 +624,20 @@ class TorchReducer(ProbabilityReducer):
             batch_size=(2, MAX_INTEGER),
             shift=(0, MAX_INTEGER),
         )
-        not_negative = "learning_rate", "weight_averaging", "weight_decay", "gain", "noise", "mixup"
-        for name in not_negative:
+        for name in ("learning_rate", "weight_averaging", "weight_decay", "gain", "noise", "mixup"):
             value = getattr(self, name)
-            is_valid = is_number(value) and 0.0 <= value < float("inf")
-            expect(is_valid, f"{name} >= 0, a number", value)
+            expect(
+                is_number(value) and 0.0 <= value < float("inf"), f"{name} >= 0, a number", value
+            )
         expect(self.learning_rate > 0.0, "learning_rate > 0", self.learning_rate)
-        is_path = isinstance(self.checkpoint, str | PathLike)
-        expect(is_path, 'checkpoint, the name of a file, or ""', self.checkpoint)
-        is_share = self.weight_averaging < 1.0
-        expect(is_share, "weight_averaging from 0 to below 1", self.weight_averaging)
+        expect(
+            isinstance(self.checkpoint, str | PathLike),
+            'checkpoint, the name of a file, or ""',
+            self.checkpoint,
+        )
+        expect(
+            self.weight_averaging < 1.0, "weight_averaging from 0 to below 1", self.weight_averaging
+        )
 
 
 def draw_batches(
@@ -656,9 +670,9 @@ def draw_batches(
     pools = [np.flatnonzero(folds != k) for k in range(n_folds)]
     smallest = min(map(len, pools))
     if smallest < 2:
-        actual = f"{smallest} (n_samples = {len(folds)}); all traces may be the same"
         raise SettingError(
-            f"Expected at least 2 traces outside each fold, got {actual}. "
+            f"Expected at least 2 traces outside each fold, got {smallest} "
+            f"(n_samples = {len(folds)}); all traces may be the same. "
             "Check the sensor and the unit."
         )
     size = min(batch_size, smallest)

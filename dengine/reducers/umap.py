@@ -121,9 +121,8 @@ class UmapEncoder(nn.Module):
         self.smallest_square = SMALLEST_SQUARE
         self.total_strength = log2(n_neighbors)
         self.dim = points.size(1)
-        half_norms = 0.5 * references.square().sum(1)
         self.register_buffer("references", padded(references, 0.0))
-        self.register_buffer("half_norms", padded(half_norms, torch.inf))
+        self.register_buffer("half_norms", padded(0.5 * references.square().sum(1), torch.inf))
         self.register_buffer("points", padded(points, 0.0))
         # 1 / sigma, in units of 1 / the mean of the distances beyond rho
         self.register_buffer("rates", torch.logspace(-2.0, 3.0, 48))
@@ -316,8 +315,7 @@ class UmapReducer(Reducer):
         if self.n_epochs is not None:
             return self.n_epochs
         largest = min(MAX_EPOCHS, max(1, MAX_WORK // n_traces))
-        wanted = self.n_steps_left_ or max(MIN_EPOCHS, WORK // n_traces)
-        return min(wanted, largest)
+        return min(self.n_steps_left_ or max(MIN_EPOCHS, WORK // n_traces), largest)
 
     def precompute(self, X: Floats, numbers: Ints | None = None) -> None:
         """Search the neighbours of traces X (n, C, T), and keep them for the next training.
@@ -333,8 +331,9 @@ class UmapReducer(Reducer):
         traces = self._check(X, reset=not self._is_fitted)
         if not self._is_fitted:
             self._initialize(traces)
-        neighbors = self.neighbors_.update(traces, numbers, self.make_frames_)
-        self.precomputed_neighbors_: Neighbors | None = neighbors
+        self.precomputed_neighbors_: Neighbors | None = self.neighbors_.update(
+            traces, numbers, self.make_frames_
+        )
 
     @property
     def _is_fitted(self) -> bool:
@@ -348,8 +347,9 @@ class UmapReducer(Reducer):
         """
         if "neighbors_" not in vars(self):
             return False
-        neighbors = self.precomputed_neighbors_ or self.neighbors_
-        return bool(np.isin(numbers, neighbors.numbers).any())
+        return bool(
+            np.isin(numbers, (self.precomputed_neighbors_ or self.neighbors_).numbers).any()
+        )
 
     def _initialize(self, traces: Floats) -> None:
         """Discard all trainings, draw the seed, and set up the frames of traces (n, C, T).
@@ -363,8 +363,7 @@ class UmapReducer(Reducer):
         self.make_frames_ = frames_for(sample)
         self.make_frames_.learn(torch.from_numpy(sample))
         self.seed_ = draw_seed(self.random_state)
-        n_features = self.make_frames_.n_features
-        self.neighbors_ = Neighbors.empty(n_features, self.n_neighbors - 1)
+        self.neighbors_ = Neighbors.empty(self.make_frames_.n_features, self.n_neighbors - 1)
         self.precomputed_neighbors_ = None
         self.embedding_ = torch.zeros(0, self.n_components)
         self.n_epochs_ = 0
@@ -392,8 +391,9 @@ class UmapReducer(Reducer):
         generator = torch.Generator().manual_seed(int(rng.integers(2**63)))
         last_neighbors = self.precomputed_neighbors_ or self.neighbors_
         neighbors = last_neighbors.update(traces, numbers, self.make_frames_)
-        strengths = membership_strengths(neighbors.distances, self.n_neighbors)
-        graph = fuzzy_simplicial_set(neighbors.indices, strengths)
+        graph = fuzzy_simplicial_set(
+            neighbors.indices, membership_strengths(neighbors.distances, self.n_neighbors)
+        )
         points = self._starting_points(neighbors, graph, rng)
         n_epochs = n_epochs or self.n_epochs_due(len(traces))
         points, n_taken = optimize_layout(points, graph, self.min_dist, n_epochs, stop, generator)
@@ -437,10 +437,9 @@ class UmapReducer(Reducer):
         self.neighbors_ = neighbors
         self.precomputed_neighbors_ = None
         self.embedding_ = points
-        encoder = UmapEncoder(
+        self.encoder_ = UmapEncoder(
             self.make_frames_, neighbors.frames, points, self.n_neighbors, self.min_dist
-        )
-        self.encoder_ = encoder.eval()
+        ).eval()
 
     def embed(self, X: Floats) -> Floats:
         """Embed traces (n, T) or (n, C, T) among the references; return float32 (n, 1, d).
@@ -461,9 +460,13 @@ class UmapReducer(Reducer):
             return self.encoder_
         n = max(len(X), self.n_neighbors + 1)
         make_frames = frames_for(X)
-        references = torch.zeros(n, make_frames.n_features)
-        points = torch.zeros(n, self.n_components)
-        return UmapEncoder(make_frames, references, points, self.n_neighbors, self.min_dist).eval()
+        return UmapEncoder(
+            make_frames,
+            torch.zeros(n, make_frames.n_features),
+            torch.zeros(n, self.n_components),
+            self.n_neighbors,
+            self.min_dist,
+        ).eval()
 
     def module(self) -> UmapEncoder:
         """Return the present `encoder_` itself, (B, C, T) -> (B, 1, d).
@@ -505,11 +508,17 @@ class UmapReducer(Reducer):
         among them. Raises NotFittedError before a fit.
         """
         check_is_fitted(self, "encoder_")
-        counts = [self.make_frames_.n_frames, self.seed_]
-        counts += [self.n_epochs_, self.n_steps_, self.n_new_steps_]
         return module_state(self.make_frames_, "frames.") | {
             "shape": np.array(self.trace_shape_),
-            "counts": np.array(counts),
+            "counts": np.array(
+                [
+                    self.make_frames_.n_frames,
+                    self.seed_,
+                    self.n_epochs_,
+                    self.n_steps_,
+                    self.n_new_steps_,
+                ]
+            ),
             "numbers": self.neighbors_.numbers,
             "references": self.neighbors_.frames.numpy(),
             "neighbors": self.neighbors_.indices.numpy().astype(np.int32),
@@ -530,13 +539,15 @@ class UmapReducer(Reducer):
         self.seed_, self.n_epochs_, self.n_steps_, self.n_new_steps_ = counts
         self.make_frames_ = Frames(channels, samples, n_frames)
         restore(self.make_frames_, arrays_with_prefix(state, "frames."))
-        neighbors = Neighbors(
-            numbers=np.array(state["numbers"]),
-            frames=torch.from_numpy(np.array(state["references"])),
-            indices=torch.from_numpy(state["neighbors"].astype(np.int64)),
-            distances=torch.from_numpy(np.array(state["distances"])),
+        self._set_references(
+            Neighbors(
+                numbers=np.array(state["numbers"]),
+                frames=torch.from_numpy(np.array(state["references"])),
+                indices=torch.from_numpy(state["neighbors"].astype(np.int64)),
+                distances=torch.from_numpy(np.array(state["distances"])),
+            ),
+            torch.from_numpy(np.array(state["embedding"])),
         )
-        self._set_references(neighbors, torch.from_numpy(np.array(state["embedding"])))
         return self
 
     def _check(self, X: ArrayLike, reset: bool) -> Floats:
@@ -552,12 +563,16 @@ class UmapReducer(Reducer):
         """
         traces = self.check_traces(X, reset=reset)
         check_integers(self, n_components=(1, 100), n_neighbors=(2, 1000))
-        is_distance = is_number(self.min_dist) and 0.0 <= self.min_dist <= 1.0
-        expect(is_distance, "min_dist from 0 to 1", self.min_dist)
+        expect(
+            is_number(self.min_dist) and 0.0 <= self.min_dist <= 1.0,
+            "min_dist from 0 to 1",
+            self.min_dist,
+        )
         epochs = self.n_epochs
         expect(epochs is None or is_whole(epochs, 1, 10**6), "n_epochs of 1 or more", epochs)
         smallest = max(self.n_neighbors, self.n_components)
         if len(traces) <= smallest:
-            actual = f"n_samples = {len(traces)}"
-            raise SettingError(f"UMAP needs more than {smallest} traces, got {actual}.")
+            raise SettingError(
+                f"UMAP needs more than {smallest} traces, got n_samples = {len(traces)}."
+            )
         return traces

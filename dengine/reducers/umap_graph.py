@@ -86,8 +86,7 @@ def frames_for(traces: Floats) -> Frames:
     fewer than 100 samples get a frame for each sample.
     """
     _, channels, samples = traces.shape
-    n_frames = samples // averaging(torch.from_numpy(traces), MIN_FRAMES)
-    return Frames(channels, samples, n_frames)
+    return Frames(channels, samples, samples // averaging(torch.from_numpy(traces), MIN_FRAMES))
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,8 +127,9 @@ class Neighbors:
 
         It is -1 for a number that this object does not have. The numbers may be in any order.
         """
-        row = np.searchsorted(self.numbers, numbers)
-        return torch.from_numpy(np.where(np.isin(numbers, self.numbers), row, -1))
+        return torch.from_numpy(
+            np.where(np.isin(numbers, self.numbers), np.searchsorted(self.numbers, numbers), -1)
+        )
 
     def update(self, traces: Floats, numbers: Ints, make_frames: Frames) -> "Neighbors":
         """Return a new object with the neighbours among these traces; this one does not change.
@@ -251,8 +251,7 @@ def squared_distances(x: Tensor, y: Tensor) -> Tensor:
 
     They are rounded, so that a small one may be wrong or negative.
     """
-    products = torch.addmm(y.square().sum(1), x, y.T, alpha=-2.0)
-    return products.add_(x.square().sum(1, keepdim=True))
+    return torch.addmm(y.square().sum(1), x, y.T, alpha=-2.0).add_(x.square().sum(1, keepdim=True))
 
 
 def membership_strengths(distances: Tensor, n_neighbors: int) -> Tensor:
@@ -322,7 +321,8 @@ def fuzzy_simplicial_set(indices: Tensor, strengths: Tensor) -> csr_matrix:
     Algorithm 1 of McInnes et al. (2018).
     """
     n, k = indices.shape
-    starts = np.arange(0, n * k + 1, k)
-    one_way = csr_matrix((strengths.flatten().numpy(), indices.flatten().numpy(), starts), (n, n))
+    one_way = csr_matrix(
+        (strengths.flatten().numpy(), indices.flatten().numpy(), np.arange(0, n * k + 1, k)), (n, n)
+    )
     other_way = one_way.T.tocsr()
     return one_way + other_way - one_way.multiply(other_way)

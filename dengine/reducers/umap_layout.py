@@ -120,8 +120,7 @@ def principal_components(frames: Tensor, n: int) -> NDArray[np.float64]:
     evenly spaced. If there are fewer than n components, the last columns are 0.
     """
     centred = (frames - frames.mean(0)).double()
-    sample = centred[:: 1 + len(centred) // PCA_TRACES]
-    axes = torch.linalg.svd(sample, full_matrices=False).Vh[:n]
+    axes = torch.linalg.svd(centred[:: 1 + len(centred) // PCA_TRACES], full_matrices=False).Vh[:n]
     components = np.zeros((len(frames), n))
     components[:, : len(axes)] = (centred @ axes.T).numpy()
     return components
@@ -191,8 +190,9 @@ class Edges:
 
     def sum_by_head(self, values: Tensor) -> Tensor:
         """Sum values of edges (d, E) over the edges of each head: (d, n), 0 without edges."""
-        lengths = self.counts.expand(len(values), -1).contiguous()
-        return torch.segment_reduce(values, "sum", lengths=lengths, axis=1)
+        return torch.segment_reduce(
+            values, "sum", lengths=self.counts.expand(len(values), -1).contiguous(), axis=1
+        )
 
 
 def attraction_coefficients(strengths: Tensor, squared: Tensor, a: float, b: float) -> Tensor:
@@ -361,8 +361,7 @@ def optimize_layout(
     """
     a, b = find_ab_params(min_dist)
     edges = Edges.from_graph(graph)
-    n = len(points)
-    count = min(NEGATIVE_SAMPLES, n - 1)
+    count = min(NEGATIVE_SAMPLES, len(points) - 1)
     weight = NEGATIVE_SAMPLE_RATE * edges.sum_by_head(edges.strength.unsqueeze(0))  # (1, n)
     points = points.T.contiguous()  # (d, n)
     n_taken = 0

@@ -82,8 +82,10 @@ class UmapLearnReducer(Reducer):
         traces = self.check_traces(X, reset=True)
         n = len(traces)
         if n <= self.n_neighbors:
-            wanted = f"more than n_neighbors = {self.n_neighbors} traces"
-            raise SettingError(f"UMAP needs {wanted}, got n_samples = {n}.")
+            raise SettingError(
+                f"UMAP needs more than n_neighbors = {self.n_neighbors} traces, "
+                f"got n_samples = {n}."
+            )
         from umap import UMAP
 
         with shielded():
@@ -113,8 +115,9 @@ class UmapLearnReducer(Reducer):
         Raises NotFittedError before `fit`, and the errors of `check_traces`.
         """
         check_is_fitted(self, "umap_")
-        points = [self._transform_batch(trace[None]) for trace in self.check_traces(X)]
-        return np.array(points, dtype=np.float32).reshape(-1, 1, self.n_components)
+        return np.array(
+            [self._transform_batch(trace[None]) for trace in self.check_traces(X)], dtype=np.float32
+        ).reshape(-1, 1, self.n_components)
 
     def _transform_batch(self, traces: Floats) -> Floats:
         """Place traces (n, C, T) by umap-learn, together: float32 (n, d)."""
