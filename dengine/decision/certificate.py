@@ -168,9 +168,9 @@ def cusum(share: float, parts: float) -> tuple[int, int]:
     limit = 1
     while _run_length(share, step, limit) < parts:
         limit = 2 * limit
-    limits = range(limit + 1)
-    too_low = max(1, limit // 2)
-    return step, bisect_left(limits, parts, too_low, key=partial(_run_length, share, step))
+    return step, bisect_left(
+        range(limit + 1), parts, lo=max(1, limit // 2), key=partial(_run_length, share, step)
+    )
 
 
 def _run_length(share: float, step: int, limit: int) -> float:
@@ -318,8 +318,7 @@ class Certificate:
         """
         check, escape, _ = prices
         n_unchecked = self.accepted.n_unchecked
-        n_escaped = min(n_unchecked, self.accepted.n * self.accepted.upper)
-        return n_unchecked * check, escape * n_escaped
+        return n_unchecked * check, escape * min(n_unchecked, self.accepted.n * self.accepted.upper)
 
     @property
     def kept(self) -> bool:
@@ -337,12 +336,14 @@ class Certificate:
         least or, if it is not above 0, lost at most. These costs are missing if the bound is 1 or
         all parts were checked. With prices the last sentence says when accepting pauses.
         """
-        unknown = (
+        claim = self._claim(
+            self.accepted,
+            "that went on without a check",
+            "accept",
+            "bad",
             "silence is no success: set an audit rate, or stops to all if every bad part stops the "
-            "system"
+            "system",
         )
-        which = "that went on without a check"
-        claim = self._claim(self.accepted, which, "accept", "bad", unknown)
         if self.prices is None:
             return claim
         n_unchecked = self.accepted.n_unchecked
@@ -369,8 +370,13 @@ class Certificate:
 
         If nothing can be claimed, it says so, and why.
         """
-        unknown = "nobody looks at what is rejected: set audit_rate"
-        return self._claim(self.rejected, "rejected without a check", "reject", "good", unknown)
+        return self._claim(
+            self.rejected,
+            "rejected without a check",
+            "reject",
+            "good",
+            "nobody looks at what is rejected: set audit_rate",
+        )
 
     def _claim(self, group: OutcomeBound, which: str, verb: str, wrong: str, unknown: str) -> str:
         """Return the claim about a group of parts as one sentence.
@@ -511,8 +517,11 @@ def _bound_audits(
     """
     n = n_unchecked + n_audited
     bound = _bound_outcomes(n, n_audited, n_bad, n_unchecked, audit_rate, alpha)
-    upper = max(bound.upper, (n_bad + n_others) / max(1, n))
-    return replace(bound, upper=upper, shadowed=audit_rate == 1.0 and n_unchecked == 0)
+    return replace(
+        bound,
+        upper=max(bound.upper, (n_bad + n_others) / max(1, n)),
+        shadowed=audit_rate == 1.0 and n_unchecked == 0,
+    )
 
 
 def _bound_outcomes(

@@ -83,14 +83,14 @@ class WilsonRadiusClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[mi
             For `radius`, `alpha`, `lower_bound` or `interval` out of its range; `capacity` is not
             checked.
         """
-        Z, y = validate_data(self, Z, y)
-        self.classes_ = classes_of(y)
-        self.index_ = RadiusIndex(np.asarray(Z).shape[1], self.capacity)
+        points, labels = validate_data(self, Z, y)
+        self.classes_ = classes_of(labels)
+        self.index_ = RadiusIndex(points.shape[1], self.capacity)
         self.neighbours_ = self.neighbours_over(self.index_)
-        success = np.asarray(y) == self.classes_[-1]
+        success = labels == self.classes_[-1]
         if len(self.classes_) == 1 and self.classes_[0] in (0, False, -1):
             success = ~success  # a lone class of zeros is all failures
-        self.index_.add(Z, success)
+        self.index_.add(points, success)
         return self
 
     def count(self, Z: ArrayLike) -> tuple[Ints, Ints]:
@@ -124,8 +124,9 @@ class WilsonRadiusClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[mi
         It is ACCEPT if lower >= `lower_bound`, otherwise REJECT if upper <= 1 - `lower_bound`.
         Raises NotFittedError before `fit`.
         """
-        positions = self._decisions(Z)[:, 0]
-        return np.array([ACTIONS[int(position)] for position in positions], dtype=object)
+        return np.array(
+            [ACTIONS[int(position)] for position in self._decisions(Z)[:, 0]], dtype=object
+        )
 
     def predict_proba(self, Z: ArrayLike) -> Floats:
         """Return the observed rates of both classes within the radius; NotFittedError before `fit`.
@@ -199,8 +200,9 @@ class WilsonRadiusClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[mi
         refuses (TypeError for sparse ones).
         """
         check_is_fitted(self)
-        valid = validate_data(self, Z, reset=False)
-        embeddings = torch.from_numpy(np.array(valid, dtype=np.float32))
+        embeddings = torch.from_numpy(
+            np.array(validate_data(self, Z, reset=False), dtype=np.float32)
+        )
         with torch.inference_mode():
             rows = [self.neighbours_(z[None, :]) for z in embeddings]
         return np.array(rows, dtype=np.float64).reshape(-1, 5)

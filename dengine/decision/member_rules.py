@@ -87,8 +87,12 @@ class WatchedRule(MemberRule):
     def __init__(self, alpha: float, lower_bound: float, interval: str = "wilson") -> None:
         tolerance = 1.0 - float(lower_bound)
         levels = [float(lower_bound)]
-        evidence = MemberEvidence(alpha, (tolerance, tolerance), [levels, levels], kind="watched")
-        super().__init__(alpha, lower_bound, interval, evidence)
+        super().__init__(
+            alpha,
+            lower_bound,
+            interval,
+            MemberEvidence(alpha, (tolerance, tolerance), [levels, levels], kind="watched"),
+        )
 
 
 class PooledRule(MemberRule):
@@ -119,10 +123,12 @@ class PooledRule(MemberRule):
         step = 0.5 * tolerance
         n_levels = int((lower_bound - LOWEST_LEVEL) / step + 1e-9) + 1
         levels = [float(lower_bound) - i * step for i in range(n_levels)]
-        evidence = MemberEvidence(
-            alpha, (tolerance, tolerance), [levels, levels], inclusion_probability
+        super().__init__(
+            alpha,
+            lower_bound,
+            interval,
+            MemberEvidence(alpha, (tolerance, tolerance), [levels, levels], inclusion_probability),
         )
-        super().__init__(alpha, lower_bound, interval, evidence)
         self.extra_arguments = (inclusion_probability,)
 
 
@@ -154,6 +160,10 @@ class PricedRule(MemberRule):
         inclusion_probability: float = 1.0,
     ) -> None:
         levels = [[1.0 - share * tolerance for share in PRICED_LEVELS] for tolerance in tolerances]
-        evidence = MemberEvidence(alpha, tolerances, levels, inclusion_probability, kind="priced")
-        super().__init__(alpha, lower_bound, interval, evidence)
+        super().__init__(
+            alpha,
+            lower_bound,
+            interval,
+            MemberEvidence(alpha, tolerances, levels, inclusion_probability, kind="priced"),
+        )
         self.extra_arguments = (tolerances, inclusion_probability)

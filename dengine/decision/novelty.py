@@ -218,8 +218,8 @@ def fit_novelty(
     gate.noise_floor.copy_(_noise_floor(gate, x))
     plain = gate.plain_features(x).double().nan_to_num()
     # Kind of each feature: 0 minimum, 1 maximum, 2 and 3 roughness, 4 gaps; 5 distortions.
-    kinds = torch.arange(5).repeat_interleave(torch.tensor([*4 * [gate.segments], 3]))
-    kinds = kinds.repeat(channels)
+    counts = torch.tensor([*4 * [gate.segments], 3])
+    kinds = torch.arange(5).repeat_interleave(counts).repeat(channels)
     gate.discriminants.copy_(_discriminants(gate, x, plain, kinds < 4))
     features = torch.cat([plain, plain @ gate.discriminants.double()], 1).nan_to_num()
     offset, gain = _standardise(features)
@@ -267,8 +267,9 @@ def _noise_floor(gate: NoveltyGate, x: Tensor) -> Tensor:
     if n_samples > 1:
         steps = torch.linalg.vector_norm(torch.diff(x), dim=2).median(0).values
     # In the order of `plain_features`: first and second differences of segments, then brief ones.
-    brief = [2 * gate.brief, gate.brief, gate.brief]
-    lengths = torch.tensor([*2 * gate.segments * [gate.length], *brief])
+    lengths = torch.tensor(
+        [*2 * gate.segments * [gate.length], 2 * gate.brief, gate.brief, gate.brief]
+    )
     return (0.05 * (lengths / n_samples).sqrt() * steps[:, None]).clamp(min=1e-12)
 
 
@@ -319,8 +320,9 @@ def _discriminants(gate: NoveltyGate, x: Tensor, plain: Tensor, used: Tensor) ->
     for distorted in _distort(x[some]):
         features = gate.plain_features(distorted).double().nan_to_num()
         other = torch.addcmul(offset, features, gain).clamp(-6.0, 6.0)
-        pooled = covariance + 0.5 * torch.cov(other.T)
-        directions.append(torch.linalg.solve(pooled, (other - z[some]).mean(0)))
+        directions.append(
+            torch.linalg.solve(covariance + 0.5 * torch.cov(other.T), (other - z[some]).mean(0))
+        )
     return (gain[:, None] * torch.stack(directions, 1)).float()
 
 
@@ -337,9 +339,9 @@ def _standardise(features: Tensor) -> tuple[Tensor, Tensor]:
     n = len(features)
     n_outer = 1 + n // TAIL_TRACES
     ordered = np.partition(features.numpy().T, (n_outer, n - 1 - n_outer), 1)  # (P, n)
-    low = torch.from_numpy(ordered[:, n_outer])
-    high = torch.from_numpy(ordered[:, -1 - n_outer])
-    inner = features.clamp(low, high)
+    inner = features.clamp(
+        torch.from_numpy(ordered[:, n_outer]), torch.from_numpy(ordered[:, -1 - n_outer])
+    )
     mean = inner.mean(0)
     deviation = inner.std(0, unbiased=False)
     floor = 1e-2 * deviation.median() + 1e-5 * mean.abs() + 1e-12
@@ -357,8 +359,7 @@ def _find_same(traces: NDArray[np.float32], parts: NDArray[np.int64] | None) -> 
     numbers: dict[bytes, int] = {}
     content = np.array([numbers.setdefault(x.tobytes(), len(numbers)) for x in traces])
     part = content if parts is None else parts
-    same_part = part[:, None] == part
-    same = (content[:, None] == content) | same_part
+    same = (content[:, None] == content) | (part[:, None] == part)
     return torch.from_numpy(same), int((~np.tril(same, -1).any(1)).sum())
 
 

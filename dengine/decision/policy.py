@@ -209,8 +209,7 @@ class Policy:
         In this text a space separates two limits. All other values stay as they are, so `prices` is
         a tuple.
         """
-        limits = " ".join(map(str, self.force_limits)) or NO_LIMITS
-        return asdict(self) | {"force_limits": limits}
+        return asdict(self) | {"force_limits": " ".join(map(str, self.force_limits)) or NO_LIMITS}
 
     @classmethod
     def from_values(cls, values: Mapping[str, Any]) -> Self:
@@ -342,8 +341,10 @@ class Policy:
             prices if the guarantee is "cost".
         """
         if self.stops == "all":
-            bad = outcomes.false_accepts + outcomes.forgotten_accepts
-            outcomes = replace(outcomes, accepted=bad + outcomes.confirmed)
+            outcomes = replace(
+                outcomes,
+                accepted=outcomes.false_accepts + outcomes.forgotten_accepts + outcomes.confirmed,
+            )
         certificate = certify(
             outcomes, self.alpha, self.tolerances[0], self.stops, self.audited_share
         )
@@ -358,8 +359,9 @@ class Policy:
         shape. ValueError for other shapes and negative counts. The error level is alpha. Under
         the guarantees "pooled" and "cost", where the interval only sorts parts, it is 0.5.
         """
-        error_level = interval_error_level(self.alpha, self.guarantee)
-        return INTERVALS[self.interval](n_success, n_failure, error_level)
+        return INTERVALS[self.interval](
+            n_success, n_failure, interval_error_level(self.alpha, self.guarantee)
+        )
 
     def action(self, lower: float, upper: float) -> Action:
         """Return the action that a bound (lower, upper) allows, whatever the guarantee is.
@@ -369,8 +371,9 @@ class Policy:
         """
         from .rule import action_of
 
-        reject_threshold = 1.0 - self.lower_bound
-        return ACTIONS[action_of(float(lower), float(upper), self.lower_bound, reject_threshold)]
+        return ACTIONS[
+            action_of(float(lower), float(upper), self.lower_bound, 1.0 - self.lower_bound)
+        ]
 
 
 def check_radius(radius: float) -> None:

@@ -355,8 +355,11 @@ class RadiusIndex(nn.Module):
             torch.tensor(np.zeros(len(z)) if values is None else np.asarray(values))
             for values in (labels, spaces, parts, numbers)
         ]
-        is_column = all(column.shape == z.shape[:1] for column in columns)
-        if z.ndim != 2 or z.size(1) != self.dim or not is_column:
+        if (
+            z.ndim != 2
+            or z.size(1) != self.dim
+            or any(column.shape != z.shape[:1] for column in columns)
+        ):
             shapes = ", ".join(str(tuple(values.shape)) for values in (z, *columns))
             raise ValueError(
                 f"Expected points (n, {self.dim}) with n labels, n spaces, n parts and n numbers, "
@@ -416,8 +419,9 @@ class RadiusIndex(nn.Module):
         Nothing changes if no part came twice; see `label_agreement`.
         """
         if int(self.repeats) > 0:
-            columns = map(self.column, ("points", "labels", "spaces", "parts"))
-            self.agreement.fill_(label_agreement(*columns))
+            self.agreement.fill_(
+                label_agreement(*map(self.column, ("points", "labels", "spaces", "parts")))
+            )
 
     def _count_repeats(self) -> None:
         """Set `repeats`: the number of points of known parts, less the number of these parts."""
@@ -460,9 +464,11 @@ class RadiusIndex(nn.Module):
         The bytes are points (d, n) float32, labels float32 and spaces int64, one after the other,
         each in the order of the slots, the positions of the points in the index.
         """
-        points = self.column("points").T
-        labels = self.column("labels").astype(np.float32)
-        arrays = (points, labels, self.column("spaces"))
+        arrays = (
+            self.column("points").T,
+            self.column("labels").astype(np.float32),
+            self.column("spaces"),
+        )
         return hashlib.sha256(
             b"".join(np.ascontiguousarray(a).tobytes() for a in arrays)
         ).hexdigest()

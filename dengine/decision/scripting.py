@@ -93,8 +93,11 @@ def register_tensors(module: nn.Module) -> None:
     """
     for submodule in module.modules():
         for name, value in attributes_of(submodule).items():
-            is_tensor = isinstance(value, Tensor) and not isinstance(value, nn.Parameter)
-            if is_tensor and not hasattr(type(submodule), name):
+            if (
+                isinstance(value, Tensor)
+                and not isinstance(value, nn.Parameter)
+                and not hasattr(type(submodule), name)
+            ):
                 vars(submodule).pop(name, None)
                 submodule.register_buffer(name, value.contiguous())
 
