@@ -242,8 +242,7 @@ def compiled(eager: Decider, warm_up_shape: tuple[int, ...]) -> Any:
     submodules = dict(module.named_modules(remove_duplicate=False))
     for path, submodule in eager.named_modules(remove_duplicate=False):
         for name, value in attributes_of(submodule).items():
-            is_container = isinstance(value, list | tuple | dict)
-            if isinstance(value, Tensor) or (is_container and has_tensor(value)):
+            if has_tensor(value):
                 setattr(submodules[path], name, value)
     return module
 
@@ -355,15 +354,18 @@ class ModelPrediction(EngineModel):
         user's class are raised as they are.
         """
         policy = recipe.policy
-        classifier = WilsonRadiusClassifier(
-            recipe.radius,
-            alpha=policy.alpha,
-            lower_bound=policy.lower_bound,
-            interval=policy.interval,
-            capacity=recipe.window,
-        )
         return cls(
-            recipe.make_reducer(seed), classifier, recipe.folds, policy.rule(), recipe.novelty
+            recipe.make_reducer(seed),
+            WilsonRadiusClassifier(
+                recipe.radius,
+                alpha=policy.alpha,
+                lower_bound=policy.lower_bound,
+                interval=policy.interval,
+                capacity=recipe.window,
+            ),
+            recipe.folds,
+            policy.rule(),
+            recipe.novelty,
         )
 
     @property
@@ -495,8 +497,7 @@ class ModelPrediction(EngineModel):
         X = clip_extremes(X)
         encoder = self.spaces.untrained_module(X)
         self.spaces.precompute(X, numbers)
-        is_untrained = "index" not in vars(self)
-        if is_untrained and encoder is not None and self.rule.scriptable:
+        if "index" not in vars(self) and encoder is not None and self.rule.scriptable:
             model = copy.copy(self)
             model.trace_shape = X.shape[1:]
             model.gate = NoveltyGate(*model.trace_shape)
@@ -712,9 +713,10 @@ class ModelPrediction(EngineModel):
         reducer of both; train a `successor`. Raises what `Policy.rule` raises, such as SettingError
         if the rule cannot be made.
         """
-        settings = {name: getattr(policy, name) for name in ("alpha", "lower_bound", "interval")}
         model = copy.copy(self)
-        model.classifier = clone(self.classifier).set_params(**settings)
+        model.classifier = clone(self.classifier).set_params(
+            alpha=policy.alpha, lower_bound=policy.lower_bound, interval=policy.interval
+        )
         model.rule = policy.rule()
         model.rule_is_stale = False
         model._decider = None
@@ -879,8 +881,9 @@ class ModelPrediction(EngineModel):
             state |= module_state(self.rule, "rule.")
         if not self.gate.disabled:
             state |= module_state(self.gate, "novelty.")
-        reducer_state = self.spaces.get_state() or {}
-        return state | {f"reducer.{name}": values for name, values in reducer_state.items()}
+        return state | {
+            f"reducer.{name}": values for name, values in (self.spaces.get_state() or {}).items()
+        }
 
     def set_state(self, state: Arrays) -> Self:
         """Restore the state that `get_state` returned; returns self.
@@ -900,8 +903,8 @@ class ModelPrediction(EngineModel):
         elif self.spaces.get_state() is not None:
             # Another reducer of that name, which would embed traces elsewhere.
             raise incompatible_model_error(f"{type(self.spaces).__name__} has no state")
-        self.trace_shape = tuple(int(n) for n in state["trace_shape"])
-        self.scale = np.asarray(state["scale"])
+        self.trace_shape = tuple(map(int, state["trace_shape"]))
+        self.scale = state["scale"]
         self.index = RadiusIndex.from_state(state, self.classifier.capacity)
         self.gate = NoveltyGate(*self.trace_shape)
         self.gate.disabled = not arrays_with_prefix(state, "novelty.")
