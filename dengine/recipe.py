@@ -313,8 +313,11 @@ class Recipe:
         plain = {f.name: getattr(self, f.name) for f in fields(self)}
         plain["reducer"], params = _name_and_params(self.reducer, self.params)
         del plain["params"], plain["policy"]
-        policy = {f.name: getattr(self.policy, f.name) for f in fields(self.policy)}
-        tables = {"": plain, "policy": policy, "params": params}
+        tables = {
+            "": plain,
+            "policy": {f.name: getattr(self.policy, f.name) for f in fields(self.policy)},
+            "params": params,
+        }
         # An empty [params] is written too: left out, it would mean those of the reducer's recipe.
         return "\n".join(_table_text(name, values) for name, values in tables.items())
 
@@ -326,8 +329,9 @@ class Recipe:
         value out of range, and if the class of this reducer must be imported for that, and cannot
         be; TypeError for an unknown setting.
         """
-        changes = {name: value for name, value in settings.items() if value is not None}
-        return replace(self, **changes)
+        return replace(
+            self, **{name: value for name, value in settings.items() if value is not None}
+        )
 
     def with_policy(self, **changes: Any) -> Recipe:
         """Return a copy whose policy has these settings changed, as `Policy.changed` does.
@@ -441,10 +445,11 @@ def _table_text(name: str, values: Table) -> str:
 
     None becomes "none".
     """
-    lines = [f"[{name}]\n"] if name else []
-    for key, value in values.items():
-        lines.append(f"{key} = {toml_value('none' if value is None else value)}\n")
-    return "".join(lines)
+    heading = f"[{name}]\n" if name else ""
+    return heading + "".join(
+        f"{key} = {toml_value('none' if value is None else value)}\n"
+        for key, value in values.items()
+    )
 
 
 RECIPES: dict[str, Recipe] = {

@@ -375,8 +375,7 @@ class ForceLimitsGate(nn.Module):
         for item in force_limits:
             start, end = torch.tensor([item.start, item.end])
             has_samples = item.along is not None or bool(((time >= start) & (time <= end)).any())
-            has_channels = {item.channel, item.along} <= rows.keys()
-            expect(has_samples and has_channels, wanted, str(item))
+            expect(has_samples and {item.channel, item.along} <= rows.keys(), wanted, str(item))
         limits = [(item.start, item.end, item.low, item.high) for item in force_limits]
         channels = [(rows[item.channel], rows[item.along]) for item in force_limits]
         action = [ActionCode.REJECT if item.reject else ActionCode.VERIFY for item in force_limits]
