@@ -64,8 +64,7 @@ def test_a_part_is_found_and_reported_by_its_number(store, make_data):
         engine.decide(np.roll(x, 7), "P-7")
         engine.set_policy(replace(engine.policy, force_limits=("0:0:1000::reject",)))
         engine.decide(np.roll(x, 9), "P-8")
-        while_it_runs = dengine("report", store, "P-7", "bad").stderr
-        assert "or its HTTP where it is served" in while_it_runs
+        assert "or its HTTP where it is served" in dengine("report", store, "P-7", "bad").stderr
     for part, label, event in (("P-8", "good", 2), ("P-7", "bad", 3)):
         line = line_of("report", store, part, label, "--author", "kim")
         assert line.endswith(f" was {label}. Event {event}, by kim.")

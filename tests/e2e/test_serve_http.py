@@ -124,14 +124,12 @@ def test_asked_again_it_answers_the_same(client, stream):
     validate(first, "DecideResponse", client)
     again = post_raw(client, x.astype("<f4").tobytes(), channels=1, **asked).json()
     assert again | {"seconds": 0} == first | {"seconds": 0}
-    problem = must_be_problem(client.decide(stream.X[1], "order-0"), 409)
-    assert "got another" in problem["detail"]
+    assert "got another" in must_be_problem(client.decide(stream.X[1], "order-0"), 409)["detail"]
 
 
 def test_a_label_is_taken_once_and_not_against_itself(client, stream):
     client.decide(stream.X[2] * 9, "label-0")
-    unlabelled = client.get("/decisions?open=true")
-    assert unlabelled.json()["decisions"][0]["id"] == "label-0"
+    assert client.get("/decisions?open=true").json()["decisions"][0]["id"] == "label-0"
     for repeated in (False, True):
         answer = client.ask("/report", id="label-0", success=True).json()
         validate(answer, "ReportResponse", client)
@@ -168,8 +166,7 @@ def test_what_can_be_looked_at_is_as_the_document_says_also_of_a_trace_that_lack
     trace = [*stream.X[8].tolist()[:-1], None]
     answer = client.ask("/decide", trace=trace, request="missing/sample ?").json()
     assert (answer["action"], answer["reason"]) == ("verify", "not_finite")
-    shown = client.get("/explanations/missing%2Fsample%20%3F").json()
-    assert shown["trace"][0][-1] is None
+    assert client.get("/explanations/missing%2Fsample%20%3F").json()["trace"][0][-1] is None
     for path, schema in rows(LOOKS):
         validate(client.get(path).json(), schema, client)
     for path in ("nothing", "decisions/nobody", "explanations/nobody", "decisions?before=nobody"):

@@ -156,8 +156,7 @@ def test_a_baseline_is_trained_anew_at_once_and_goes_back_to_traces_as_they_are_
     assert engine.version == version + 1
     for change in (lambda: engine.forget(cycles[11].decision.id), lambda: engine.rollback(1)):
         change()
-        labels = engine.store.labels.with_traces().labels.tolist()
-        assert engine.model.y.tolist() == labels
+        assert engine.model.y.tolist() == engine.store.labels.with_traces().labels.tolist()
     change = engine.correct(wrong.decision.id, wrong.success)  # its refit is an event, too
     kinds = {event.number: event.kind for event in engine.store.events.newest()}
     assert kinds[change.event] == change.kind == "correct"
@@ -193,8 +192,7 @@ def test_safe_mode_outlasts_a_change_of_policy_and_ends_by_the_labels_as_they_ar
     with again(engine) as other:
         other.forget(*stopped)
         assert other.safe_mode == ""
-        kinds = [e.kind for e in other.store.events.newest(2)]
-        assert kinds == ["forget", "safe mode ended"]
+        assert [e.kind for e in other.store.events.newest(2)] == ["forget", "safe mode ended"]
     why = engine.safe_mode
     engine.set_policy(replace(engine.policy, lower_bound=0.85))
     assert engine.safe_mode == why

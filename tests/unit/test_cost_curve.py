@@ -66,8 +66,7 @@ def curve(
 
 def test_a_parts_cost_is_its_check_or_its_wrong_decision():
     action = ["verify", "verify", "accept", "accept", "reject", "reject"]
-    costs = part_costs(replay_of(action, [1, 0] * 3), COSTS)
-    assert costs.tolist() == [5, 5, 0, 100, 20, 0]
+    assert part_costs(replay_of(action, [1, 0] * 3), COSTS).tolist() == [5, 5, 0, 100, 20, 0]
 
 
 def test_a_part_that_an_operators_limits_reject_was_not_checked_and_pays_for_no_policy():
@@ -231,8 +230,7 @@ def test_a_search_that_is_interrupted_shows_what_was_finished(n_rounds, fresh, d
         rounds.append(tasks)
         return cheaper_by_level(tasks if len(rounds) <= n_rounds else tasks[:1])
 
-    contender = Contender.load("knn")
-    result = find_policy(data, contender, COSTS, play, lower_bounds=BOUNDS)
+    result = find_policy(data, Contender.load("knn"), COSTS, play, lower_bounds=BOUNDS)
     assert (result and result.fresh) is fresh
     assert not result or "these shuffles also chose the policy" in result.sentence
 

@@ -120,8 +120,7 @@ def test_a_report_is_counted_at_once_and_retrains_every_so_many_labels(data):
 )
 def test_a_bad_trace_is_verified_with_its_reason_kept_and_never_trained_on(line, data):
     reason, sample = line.split()
-    limit = None if reason == "too_large" else 150.0
-    engine = make(trace=TraceSpec(samples=100, limit=limit))
+    engine = make(trace=TraceSpec(samples=100, limit=None if reason == "too_large" else 150.0))
     play(engine, data, 0, 41)
     (n, *before), x = state(engine), good(data).astype(np.float64)
     x[... if reason == "constant" else 7] = float(sample)

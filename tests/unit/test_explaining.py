@@ -148,8 +148,7 @@ def test_the_envelope_counts_the_samples_that_leave_it_and_needs_twenty_successe
     trace[1, 20:24], trace[0, 40], trace[0, 3] = 6.0, -5.0, np.nan  # a NaN lies nowhere
     result = envelope_of(X, trace)
     assert result.outside == pytest.approx(5 / 100)
-    inside = (result.low <= X) & (result.high >= X)
-    assert inside.mean() == pytest.approx(0.95, abs=0.01)
+    assert ((result.low <= X) & (result.high >= X)).mean() == pytest.approx(0.95, abs=0.01)
     assert envelope_of(X[:19], trace) is None
 
 

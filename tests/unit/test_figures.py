@@ -67,8 +67,7 @@ def test_the_promise_is_kept_up_to_the_tolerance(bad, kept):
 
 def test_guarantees_and_what_is_known_of_stops_are_rows_of_their_own():
     recipe = RECIPE.with_policy(guarantee="pooled", stops="all")
-    replays = [MANY_RIGHT, MANY_RIGHT, replay_of(["accept"] * 300, [1] * 300, recipe)]
-    rows = pooled(replays)
+    rows = pooled([MANY_RIGHT, MANY_RIGHT, replay_of(["accept"] * 300, [1] * 300, recipe)])
     shown = [(row["guarantee"], row["stops"], row["retrains_dropped"]) for row in rows]
     assert shown == [("local", "some", 2), ("pooled", "all", 1)]
     assert list(pooled_table(rows, "", "").columns[0].cells) == [

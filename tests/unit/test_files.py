@@ -39,8 +39,7 @@ def test_no_folder_device_pipe_or_link_is_written_to_even_by_force(tmp_path, mon
     Path("dangling").symlink_to("nothing")
     places = {"/dev/null": "device", "dangling": "link"}
     for name in ("folder", "pipe", "link", *places):
-        match = f"is a {places.get(name, name)}; name another one"
-        with pytest.raises(OutputError, match=match):
+        with pytest.raises(OutputError, match=f"is a {places.get(name, name)}; name another one"):
             write_output(Path(name), b"new", force)
     assert Path("mine").read_bytes() == TEXT
     assert not Path("nothing").exists()

@@ -226,8 +226,7 @@ def test_what_one_cell_puts_right_reaches_its_peers_and_a_reopened_one(fleet, pa
     first.correct(wrong, False)
     first.forget(*gone)
     second.poll()
-    kept = first.store.labels.with_traces().seq.tolist()
-    assert numbers(first) == numbers(second) == kept
+    assert numbers(first) == numbers(second) == first.store.labels.with_traces().seq.tolist()
     results = [verify_history(fleet.url, engine.store.cell_id) for engine in (first, second)]
     assert [report.faults for report in results] == [(), ()]
     assert results[0].cells[0].digest != results[1].cells[0].digest  # each has a ledger of its own

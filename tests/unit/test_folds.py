@@ -72,16 +72,14 @@ def test_a_hash_depends_on_the_values_of_its_trace_alone():
 
 @given(traces)
 def test_the_scripted_gate_hashes_as_numpy_does_for_any_float(x):
-    gate = TraceGate(x.size)
-    assert gate(torch.from_numpy(x))[1] == content_hash(x[None])[0]
+    assert TraceGate(x.size)(torch.from_numpy(x))[1] == content_hash(x[None])[0]
 
 
 @pytest.mark.parametrize("step", [2.0**-20, 1.0])  # of a sensor: low bits of a raw hash are zeros
 @pytest.mark.parametrize("folds", [2, 5])
 def test_folds_are_balanced(folds, step):
     X = np.round(noise(10_000, 20) / step) * step
-    sizes = np.bincount(content_fold(X, folds), minlength=folds)
-    assert stats.chisquare(sizes).pvalue > 1e-4
+    assert stats.chisquare(np.bincount(content_fold(X, folds), minlength=folds)).pvalue > 1e-4
 
 
 @pytest.mark.parametrize("folds", [[0], [0, 2], [-1, 0]])
@@ -95,8 +93,7 @@ def test_the_audit_coin_keeps_its_rate_and_ignores_the_fold(rate):
     h = content_hash(noise(8_000, 20))
     coin, fold = audited(h, rate, seed=3), fold_of(h, 2)
     assert stats.binomtest(int(coin.sum()), len(h), rate).pvalue > 1e-4
-    table = np.bincount(2 * coin + fold).reshape(2, 2)
-    assert stats.chi2_contingency(table).pvalue > 1e-4
+    assert stats.chi2_contingency(np.bincount(2 * coin + fold).reshape(2, 2)).pvalue > 1e-4
 
 
 def test_engines_of_different_seeds_audit_different_traces():

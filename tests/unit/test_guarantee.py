@@ -95,8 +95,7 @@ def test_twice_the_tolerance_starts_safe_mode_soon_and_the_tolerance_hardly_ever
 def test_the_scripted_rule_is_told_and_asked_as_the_eager_one(guarantee, stops):
     policy = Policy(0.1, 0.9, guarantee=guarantee, stops=stops)
     eager, scripted = policy.rule(), script(policy.rule())
-    rng = np.random.default_rng(2)
-    for lower, gap, *draws in rng.random((400, 5)).tolist():
+    for lower, gap, *draws in np.random.default_rng(2).random((400, 5)).tolist():
         bad, silent, novel = (draw < 0.04 for draw in draws)
         for rule in (eager, scripted):
             rule.observe(3 * silent, novel)

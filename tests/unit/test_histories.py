@@ -96,8 +96,7 @@ def score_changed_after_its_label(patch):
     def late(self, stored, success, number, n_unreported):
         decision = stored.decision
         if self.answering is not None and decision.n_success + decision.n_failure:
-            better = 0.2 if success else -0.2
-            lower = float(np.clip(decision.lower + better, 0.0, decision.upper))
+            lower = float(np.clip(decision.lower + (0.2 if success else -0.2), 0.0, decision.upper))
             stored = replace(stored, decision=replace(decision, lower=lower))
         return learn(self, stored, success, number, n_unreported)
 

@@ -145,8 +145,7 @@ LATE = [
 @pytest.mark.parametrize("stops", ["some", "all"])
 def test_late_labels_are_imported_once_by_their_own_ids(new_store, X, tmp_path, stops):
     path, journal, counts = new_store(tmp_path / "engine.db", stops), tmp_path / "cell.csv", []
-    contrary = [line.replace("label,a-5,1", "label,a-5,0") for line in LATE]
-    for lines in (LATE, LATE, contrary):
+    for lines in (LATE, LATE, [line.replace("label,a-5,1", "label,a-5,0") for line in LATE]):
         report = import_journal(path, write_lines(journal, X, lines))
         counts.append((report.imported, report.repeated, report.contradicted))
     assert counts == [(4, 0, 0), (0, 4, 0), (0, 3, 1)]

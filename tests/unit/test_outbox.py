@@ -143,8 +143,7 @@ def test_a_late_stop_corrects_its_confirmation_and_takes_no_number(either):
     item = either.record_decision(stored("a", Action.ACCEPT, Reason.CERTAIN))
     either.record_labels([(item, label("a", True, source=Source.CONFIRMED))])
     either.drain()
-    confirmed = either.find_decision("a")
-    either.record_labels([(confirmed, label("a", False, source=Source.STOP))])
+    either.record_labels([(either.find_decision("a"), label("a", False, source=Source.STOP))])
     record(either, "b")
     either.drain()
     assert either.store.decisions.get("b").label_seq == 2
@@ -155,8 +154,7 @@ def test_a_late_stop_corrects_its_confirmation_and_takes_no_number(either):
 
 def test_a_version_is_stored_with_its_arrays_as_they_were(either):
     weights = np.zeros(3)
-    future = either.store_version(report(1), 7, {"w": weights})
-    assert either.wait_for_result(future) == 1
+    assert either.wait_for_result(either.store_version(report(1), 7, {"w": weights})) == 1
     weights += 1.0
     version = either.store.versions.newest()
     assert (version.version, version.last_seq, version.state["w"].tolist()) == (1, 7, [0.0] * 3)

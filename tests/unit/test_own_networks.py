@@ -171,8 +171,7 @@ def test_an_engine_decides_by_the_weights_that_it_trained_whatever_tensors_a_net
             np.testing.assert_allclose(points, engine.model.spaces.embed(X), atol=1e-6)
         with DataEngine.open(store, reducer=reducer_of(network, seed)) as engine:
             assert engine.version == version > 0
-            again = [engine.decide(x).embedding for x in X]
-            np.testing.assert_allclose(again, points, atol=1e-6)
+            np.testing.assert_allclose([engine.decide(x).embedding for x in X], points, atol=1e-6)
 
 
 RESTORED = "restored, as when its store is opened"

@@ -112,8 +112,7 @@ def test_force_limits_in_seconds_are_refused_at_once_while_the_rate_is_unknown(b
 
 
 def test_force_limits_along_a_path_need_no_rate(make_data):
-    policy = Policy(force_limits=("-1e9:1e9::1e6:along=0",))
-    with DataEngine("pca", policy=policy) as engine:
+    with DataEngine("pca", policy=Policy(force_limits=("-1e9:1e9::1e6:along=0",))) as engine:
         assert engine.decide(make_data(1).X[0]).reason is Reason.NO_MODEL
         assert engine.trace.rate_hz is None
 

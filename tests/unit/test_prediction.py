@@ -37,8 +37,7 @@ def test_the_decider_says_what_gate_and_prediction_say_one_after_the_other(part,
         fault, content, action, predicted, reason, *evidence, z, propensity = decided
         assert (fault, content) == trace_gate(*x.shape)(torch.from_numpy(x))
         assert (action, propensity) == (predicted, 0.0 if action else 1.0)
-        points = tuple(map(tuple, z.tolist()))
-        expected = (ACTIONS[action], *evidence, points, REASONS[reason])
+        expected = (ACTIONS[action], *evidence, tuple(map(tuple, z.tolist())), REASONS[reason])
         assert model.predict_one(x, part or content) == expected  # without a vote on itself
 
 
@@ -142,8 +141,7 @@ def test_the_cost_guarantee_draws_probabilities_towards_one_half_while_labels_ar
         decision = engine.decide(data.X[n])
         if decision.reason is not Reason.NOVEL:
             mean = np.mean([space[0] for space in decision.embedding])
-            expected = expit(logit(mean) * n / (n + 3))
-            assert decision.lower == pytest.approx(expected, abs=1e-5)
+            assert decision.lower == pytest.approx(expit(logit(mean) * n / (n + 3)), abs=1e-5)
             n_compared += 1
         engine.report(decision.id, True)
     assert n_compared > 3
@@ -157,7 +155,6 @@ def test_a_glitch_among_the_references_spoils_no_training(data):
 
 
 def test_the_scale_of_copies_of_one_trace_is_1_whatever_their_mean_rounds_to():
-    values = np.random.default_rng(0).uniform(-50.0, 50.0, (200, 2)).astype(np.float32)
-    for point in values:
+    for point in np.random.default_rng(0).uniform(-50.0, 50.0, (200, 2)).astype(np.float32):
         points = np.stack([point, point, point, point + np.float32(1e4)])  # the last is an outlier
         assert space_scale(points, np.zeros(4, np.int64), 1) == 1.0

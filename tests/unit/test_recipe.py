@@ -60,8 +60,7 @@ def test_a_text_that_would_be_read_as_none_is_no_parameter():
 def test_the_page_of_the_recipes_shows_them_as_they_are(repo):
     page = (repo / "docs" / "reference" / "recipes.md").read_text("utf-8")
     (shown,) = re.findall(r"^```toml [^\n]*\n(.*?\n)```$", page, flags=re.M | re.S)
-    recipe = Recipe.load("conv")
-    assert shown.strip() == recipe.to_toml().strip()
+    assert shown.strip() == Recipe.load("conv").to_toml().strip()
     table = [line.replace("`", "").strip("| ").split(" | ") for line in page.splitlines()]
     _, _, *rows = [cells for cells in table if len(cells) == 7]
     assert {name for name, *_ in rows} == set(RECIPES)

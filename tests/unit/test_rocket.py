@@ -128,8 +128,7 @@ def test_a_head_that_would_do_worse_than_the_base_rate_predicts_it_and_the_other
     g, y = problem(940, 50)
     # Head 1 learns from forty rows, head 0 from enough.
     outside = torch.arange(940) < torch.tensor([[900], [40]])
-    start = torch.zeros(2, 51, dtype=torch.float64)
-    w = fit_heads(g, y, outside, start, 0.01, 30, StopRule()).w
+    w = fit_heads(g, y, outside, torch.zeros(2, 51, dtype=torch.float64), 0.01, 30, StopRule()).w
     assert w[:, :-1].any(1).tolist() == [True, False]
     assert torch.sigmoid(w[1, -1]) == pytest.approx(float(y[:40].double().mean()))
 

@@ -137,8 +137,7 @@ def test_a_rule_from_outside_is_named_by_a_recipe_told_of_a_stop_and_restored(da
 @pytest.mark.usefixtures("outside")
 def test_a_rule_that_does_not_compile_decides_and_is_not_exported(data, tmp_path):
     with DataEngine(recipe=recipe_with("fuse:SpokenRule"), replaying=True) as engine:
-        actions = [cycle.decision.action for cycle in drive(engine, data)]
-        assert actions.count(Action.ACCEPT) > 50
+        assert [cycle.decision.action for cycle in drive(engine, data)].count(Action.ACCEPT) > 50
         with pytest.raises(ExportError, match=r"SpokenRule .*does not compile"):
             export_torchscript(engine, tmp_path / "model.ts")
 

@@ -39,8 +39,7 @@ def random_parts(rng: np.random.Generator, levels: list[float]) -> dict[str, Any
         rng.uniform(0.85, 1.0, N_REPLAYS),
     )
     lower = np.where(rng.random(N_REPLAYS) < 0.1, rng.random(N_REPLAYS), lower)
-    tied = rng.random(N_REPLAYS) < 0.2
-    lower = np.where(tied, rng.choice(levels, N_REPLAYS), lower)
+    lower = np.where(rng.random(N_REPLAYS) < 0.2, rng.choice(levels, N_REPLAYS), lower)
     gap = np.where(rng.random(N_REPLAYS) < 0.5, 0.0, 0.3 * rng.random(N_REPLAYS))
     return {"lower": lower, "upper": np.minimum(1.0, lower + gap)}
 

@@ -32,16 +32,14 @@ def test_a_key_is_new_secret_and_never_replaced(key, tmp_path):
     for taken in (key, tmp_path / "link.key"):
         with pytest.raises(ExportError, match="File exists; name a new file"):
             make_key(taken)
-    done = command("export", "--make-key", tmp_path / "nowhere" / "cell.key")
-    assert done.exit_code == 1
+    assert command("export", "--make-key", tmp_path / "nowhere" / "cell.key").exit_code == 1
     assert key.read_text() == kept
     assert not (tmp_path / "planted").exists()
 
 
 def test_the_signature_is_that_of_the_standard(model, key, tmp_path):
     file = export_torchscript(model, tmp_path / "model.ts", key=key)
-    secret = key.read_text().strip().encode()
-    expected = hmac.digest(secret, file.read_bytes(), "sha256").hex()
+    expected = hmac.digest(key.read_text().strip().encode(), file.read_bytes(), "sha256").hex()
     assert (tmp_path / "model.ts.sig").read_text() == f"hmac-sha256:{expected}  model.ts\n"
     assert load_exported(file, key=key).trace == TraceSpec(40)
     again = load_exported(file, key=key).save(tmp_path / "saved.ts", key=key)

@@ -89,8 +89,7 @@ def test_outcomes_count_a_label_as_it_was_corrected_and_a_forgotten_one_by_itsel
     kinds = ("accept", "accept"), ("verify", "accept"), ("verify", "reject")
     for i, (action, predicted) in enumerate(kinds * 2):
         made = decision(str(i), Action(action), Reason.CERTAIN, i // 3)
-        audit = action != predicted
-        put_decision(store, replace(made, predicted=Action(predicted), audit=audit))
+        put_decision(store, replace(made, predicted=Action(predicted), audit=action != predicted))
         put_label(store, str(i), True, Source.AUDIT)
     correct(store, False, "0", "1", "2")
     correct(store, None, "3", "4", "5")

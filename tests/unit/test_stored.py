@@ -46,8 +46,7 @@ def test_in_the_shadow_mode_every_part_is_in_it_in_order_and_replays_as_its_reco
     assert np.array_equal(data.y, stream.y)
     assert (data.name, data.rate_hz, data.unit) == ("cell", spec.rate_hz, stream.unit)
     assert data.part is None
-    lower = [replay(item, RECIPE, seed=0).lower for item in (data, stream)]
-    assert np.array_equal(*lower)
+    assert np.array_equal(*[replay(item, RECIPE, seed=0).lower for item in (data, stream)])
 
 
 def test_a_store_without_a_label_is_refused(tmp_path):

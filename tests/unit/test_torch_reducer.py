@@ -121,8 +121,7 @@ def test_without_time_for_a_step_known_traces_keep_their_points_and_new_ones_are
     folds = content_fold(X, reducer.folds)
     numbers = np.arange(60) * 2
     reducer.train(X[:40], Y[:40], folds[:40], numbers=numbers[:40])
-    late = StopRule(deadline=0.0)
-    points = reducer.train(X[10:], Y[10:], folds[10:], late, numbers[10:])
+    points = reducer.train(X[10:], Y[10:], folds[10:], StopRule(deadline=0.0), numbers[10:])
     assert reducer.report.n_steps == 0
     np.testing.assert_allclose(points, reducer.embed_references(X[10:], folds[10:]), atol=1e-5)
     trained = reducer.train(X, Y, folds, numbers=numbers)

@@ -169,8 +169,7 @@ SAMPLES = 100
 def test_cut_and_pad_keep_what_was_measured_at_its_own_time():
     x = ramp(160)[0]
     np.testing.assert_array_equal(as_trace(x, TraceSpec(SAMPLES, fit="cut"))[0], x[:SAMPLES])
-    padded = as_trace(x[:60], PADDED)[0]
-    np.testing.assert_array_equal(padded, [*x[:60], *[x[59]] * 40])
+    np.testing.assert_array_equal(as_trace(x[:60], PADDED)[0], [*x[:60], *[x[59]] * 40])
 
 
 @given(have=st.integers(50, 200), channels=st.integers(1, 3), seed=st.integers(0, 99))

@@ -26,8 +26,7 @@ contact=5     FZ_Base                     4.9 5 -5 nan 0 1 1 0
 def test_a_trigger_is_on_where_its_signals_say_so(line):
     trigger, signal, *words = line.split()
     values, on = np.array(words, dtype=float).reshape(2, -1)
-    seen = as_trigger(trigger).active({signal: values})
-    assert seen.tolist() == on.tolist()
+    assert as_trigger(trigger).active({signal: values}).tolist() == on.tolist()
     assert as_trigger(trigger).signals == (signal,)
 
 

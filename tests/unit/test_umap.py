@@ -51,8 +51,7 @@ def fitted(insertion):
 def train(reducer: UmapReducer, X: np.ndarray, numbers: np.ndarray, **limits: Any) -> np.ndarray:
     """Train as an engine does, on the traces of these labels' numbers, from 1."""
     labels = np.ones(len(numbers), dtype=np.int64)
-    stop = StopRule(**limits)
-    return reducer.train(X[numbers - 1], labels, labels, stop, numbers)
+    return reducer.train(X[numbers - 1], labels, labels, StopRule(**limits), numbers)
 
 
 @pytest.fixture
@@ -122,8 +121,7 @@ def test_frames_cover_the_whole_trace(samples, n_frames):
 
 def test_an_oscillation_is_not_averaged_away():
     phase = np.random.default_rng(0).uniform(0.0, 6.28, size=(40, 1, 1))
-    X = np.sin(2.5 * np.arange(1000) + phase).astype(np.float32)
-    assert frames_for(X).n_frames == 1000
+    assert frames_for(np.sin(2.5 * np.arange(1000) + phase).astype(np.float32)).n_frames == 1000
 
 
 def test_kept_neighbours_are_those_of_a_search_among_all(insertion):
@@ -153,8 +151,7 @@ def test_looking_ahead_changes_no_place(insertion):
     plain, ahead = UmapReducer(), UmapReducer()
     for n in (200, 260):
         ahead.precompute(X[:n], NUMBERS[:n])
-        result = train(ahead, X, NUMBERS[:n])
-        np.testing.assert_array_equal(result, train(plain, X, NUMBERS[:n]))
+        np.testing.assert_array_equal(train(ahead, X, NUMBERS[:n]), train(plain, X, NUMBERS[:n]))
 
 
 def test_state_is_restored_bit_for_bit_over_further_trainings(insertion):
