@@ -39,33 +39,41 @@ def new(name: str, policy: Policy = LOOSE, seed: int = 0, **params: Any) -> Base
 
 @pytest.fixture
 def traces(make_data):
-    """160 traces (n, 1, T) of two shapes; the first 120 are for training."""
+    """160 traces (n, 1, T) of two shapes: the first 120 are known, the others are asked about."""
     data = make_data(160, 60, failures=0.4)
-    return data.X[:, None, :], data.y
+    return data.X[:, None], data.y
+
+
+@pytest.fixture
+def known(traces):
+    return [values[:120] for values in traces]
+
+
+@pytest.fixture
+def asked(traces):
+    return traces[0][120:]
 
 
 @every_baseline
-def test_a_baseline_meets_the_model_contract_and_repeats_by_its_seed(name, traces):
-    X, y = traces
-    baseline, again = (new(name).fit(X[:120], y[:120]) for _ in range(2))
+def test_a_baseline_meets_the_model_contract_and_repeats_by_its_seed(name, known, asked):
+    baseline, again = (new(name).fit(*known) for _ in range(2))
     assert isinstance(baseline, Model)
-    lower, upper = baseline.predict_interval(X[120:])
+    lower, upper = baseline.predict_interval(asked)
     assert lower.shape == upper.shape == (40,)
     assert ((lower >= 0) & (lower <= upper) & (upper <= 1)).all()
-    for n in baseline.count(X[120:]):
+    for n in baseline.count(asked):
         assert n.shape == (40,)
         assert n.dtype.kind == "i"
         assert n.min() >= 0
-    np.testing.assert_array_equal((lower, upper), again.predict_interval(X[120:]))
-    actions = baseline.decide(X[120:])
-    assert [baseline.decide(x[None])[0] for x in X[120:130]] == list(actions[:10])
+    np.testing.assert_array_equal((lower, upper), again.predict_interval(asked))
+    actions = baseline.decide(asked)
+    assert [baseline.decide(x[None])[0] for x in asked[:10]] == list(actions[:10])
 
 
 @learning_baseline
-def test_a_baseline_is_right_on_easy_traces(name, traces):
-    X, y = traces
-    actions = new(name).fit(X[:120], y[:120]).decide(X[120:])
-    accepted, rejected = (y[120:][actions == item] for item in (Action.ACCEPT, Action.REJECT))
+def test_a_baseline_is_right_on_easy_traces(name, traces, known, asked):
+    actions, labels = new(name).fit(*known).decide(asked), traces[1][120:]
+    accepted, rejected = (labels[actions == item] for item in (Action.ACCEPT, Action.REJECT))
     assert len(accepted) >= 5
     assert accepted.all()
     assert len(rejected) >= 3
@@ -74,19 +82,19 @@ def test_a_baseline_is_right_on_easy_traces(name, traces):
 
 @learning_baseline
 @pytest.mark.parametrize("label", [1, 0])
-def test_labels_of_one_class_verify_everything(name, label, traces):
+def test_labels_of_one_class_verify_everything(name, label, traces, asked):
     X = traces[0]
     untrained = new(name).add(X[0], 1)
     trained = new(name).fit(X[:60], np.full(60, label)).add(X[60], 1)
     for baseline in (untrained, trained):
-        assert {*baseline.decide(X[120:])} == {Action.VERIFY}
-        assert not baseline.predict_interval(X[120:])[0].any()
+        assert {*baseline.decide(asked)} == {Action.VERIFY}
+        assert not baseline.predict_interval(asked)[0].any()
 
 
 @learning_baseline
-def test_what_a_copy_learns_stays_with_it(name, traces):
+def test_what_a_copy_learns_stays_with_it(name, traces, known):
     X, y = traces
-    baseline = new(name).fit(X[:120], y[:120])
+    baseline = new(name).fit(*known)
     before, successor = baseline.predict_interval(X), copy.deepcopy(baseline)
     successor.add(X[120], 1 - y[120]).fit(X[40:], 1 - y[40:])
     baseline.predict_interval(X[:5])  # what it said last is remembered
@@ -94,13 +102,13 @@ def test_what_a_copy_learns_stays_with_it(name, traces):
 
 
 @pytest.mark.parametrize("name", ["knn", "wskde"])
-def test_a_label_counts_at_once_where_the_method_learns_at_once(name, traces):
+def test_a_label_counts_at_once_where_the_method_learns_at_once(name, traces, known, asked):
     X, y = traces
-    baseline = new(name).fit(X[:120], y[:120])
-    before = baseline.predict_interval(X[120:])
+    baseline = new(name).fit(*known)
+    before = baseline.predict_interval(asked)
     for x, label in zip(X, 1 - y, strict=True):
         baseline.add(x, label)
-    assert not np.array_equal(baseline.predict_interval(X[120:]), before)
+    assert not np.array_equal(baseline.predict_interval(asked), before)
 
 
 @pytest.mark.parametrize(

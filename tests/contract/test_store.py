@@ -282,7 +282,7 @@ PRODUCT = "SCAN (label|trace|decision|model_version|correction)"
 def test_questions_go_down_an_index_also_of_a_product_and_where_there_are_corrections(
     product, never, tmp_path
 ):
-    with SqlStore(str(tmp_path / "a.db"), product=product) as store:
+    with SqlStore(f"{tmp_path}/a.db", product=product) as store:
         for name in "ab":
             put_decision(store, name)
             put_label(store, name)
@@ -315,7 +315,7 @@ def test_sqlite_syncs_every_commit_in_wal_mode(tmp_path):
 
     sa.event.listen(sa.pool.Pool, "checkout", ask)
     try:
-        with SqlStore(str(tmp_path / "a.db")) as store:
+        with SqlStore(f"{tmp_path}/a.db") as store:
             put_decision(store, "a")
     finally:
         sa.event.remove(sa.pool.Pool, "checkout", ask)
@@ -355,19 +355,19 @@ def test_what_is_no_store_of_this_dengine_is_refused_and_left_alone(statement, m
 @pytest.mark.parametrize("name", ["missing/engine.db", "."])
 def test_a_place_that_cannot_be_written_says_what_to_do(tmp_path, name):
     with pytest.raises(StoreError, match="Create the directory"):
-        SqlStore(str(tmp_path / name))
+        SqlStore(f"{tmp_path}/{name}")
 
 
 def test_a_pickle_in_the_database_is_never_loaded(tmp_path):
-    file, evil = tmp_path / "a.db", tmp_path / "evil.npz"
-    with SqlStore(str(file)) as store:
+    file, evil = f"{tmp_path}/a.db", tmp_path / "evil.npz"
+    with SqlStore(file) as store:
         store.versions.put(report(1), 0, {"w": np.zeros(1)})
     np.savez(evil, w=np.array([{}], dtype=object))
     content = evil.read_bytes()
     with sqlite3.connect(file) as connection:
         changed = content, hashlib.sha256(content).digest()
         connection.execute("UPDATE model_version SET state = ?, state_sum = ?", changed)
-    with SqlStore(str(file)) as store:
+    with SqlStore(file) as store:
         with pytest.raises(StoreError, match="plain arrays"):
             store.versions.load(1)
         assert store.versions.newest() is None

@@ -37,7 +37,7 @@ def held(file: Path) -> Iterator[None]:
 @pytest.fixture
 def in_use(tmp_path, data):
     """An engine whose newest labels are in its journal alone."""
-    with DataEngine("pca", retrain_every=1000, store=str(tmp_path / "engine.db")) as engine:
+    with DataEngine("pca", retrain_every=1000, store=tmp_path / "engine.db") as engine:
         learn(engine, data, range(IN_STORE))
         engine.flush()
         with held(tmp_path / "engine.db"):
@@ -85,7 +85,7 @@ def test_what_was_acknowledged_before_a_backup_is_in_it_though_the_engine_goes_o
             for n in range(1, 5):
                 while len(acknowledged) < 20 * n and working.running():
                     time.sleep(0.01)
-                before, copy = set(acknowledged), str(tmp_path / f"{n}.db")
+                before, copy = set(acknowledged), f"{tmp_path}/{n}.db"
                 backup_store(tmp_path / "engine.db", copy)
                 assert verify_history(copy).ok
                 with SqlStore(copy) as copied:
@@ -190,11 +190,11 @@ main()
 
 
 def test_every_cell_of_a_file_is_in_its_backup(tmp_path, data):
-    file, parts = tmp_path / "line.db", {"A": range(10), "B": range(10, 30)}
+    file, parts = f"{tmp_path}/line.db", {"A": range(10), "B": range(10, 30)}
     with ExitStack() as cells:
         engines = {}
         for name, rows in parts.items():
-            engine = DataEngine("pca", retrain_every=1000, store=SqlStore(str(file), name))
+            engine = DataEngine("pca", retrain_every=1000, store=SqlStore(file, name))
             engines[name] = cells.enter_context(engine)
             learn(engine, data, rows[:1])  # it sets the TraceSpec, which waits for the store
             engine.flush()

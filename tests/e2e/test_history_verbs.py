@@ -29,7 +29,7 @@ def store(tmp_path_factory):
     data.y[np.random.default_rng(2).random(700) < 0.02] ^= 1
     path = tmp_path_factory.mktemp("store") / "engine.db"
     policy = Policy(alpha=0.2, lower_bound=0.8, guarantee="pooled", stops="all", audit_rate=0.05)
-    with DataEngine("pca", policy, store=str(path), replaying=True) as engine:
+    with DataEngine("pca", policy, store=path, replaying=True) as engine:
         drive(engine, data)
     return path
 

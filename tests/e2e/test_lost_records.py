@@ -25,7 +25,7 @@ def left(data, tmp_path_factory):
     """
     folder, left = tmp_path_factory.mktemp("running"), tmp_path_factory.mktemp("left")
     store = folder / "engine.db"
-    with DataEngine("pca", retrain_every=1000, store=str(store)) as engine:
+    with DataEngine("pca", retrain_every=1000, store=store) as engine:
         learn(engine, data, range(IN_STORE))
         engine.flush()
         with closing(sqlite3.connect(store, isolation_level=None)) as other:
@@ -41,7 +41,7 @@ def left(data, tmp_path_factory):
 @pytest.fixture
 def store(left, tmp_path):
     """A copy of what a killed process left."""
-    return Path(shutil.copytree(left, tmp_path / "cell")) / "engine.db"
+    return f"{shutil.copytree(left, tmp_path / 'cell')}/engine.db"
 
 
 ALL = f"{2 * IN_JOURNAL} records"
@@ -92,7 +92,7 @@ def test_records_that_a_journal_lost_are_an_alarm_until_somebody_acknowledges_it
         file.unlink()
     else:
         file.write_bytes(damaged(kind, file.read_bytes()))
-        (fault,) = verify_history(str(store)).faults  # before an engine has opened it
+        (fault,) = verify_history(store).faults  # before an engine has opened it
         assert loss in fault.problem
     for _ in range(2):  # it lasts over a restart
         with DataEngine.open(store) as engine:
@@ -100,7 +100,7 @@ def test_records_that_a_journal_lost_are_an_alarm_until_somebody_acknowledges_it
             for words in (loss, "UTC", "dengine verify STORE --acknowledge"):
                 assert words in status.alarm
             assert kind not in ("swapped", "header") or status.labels == IN_STORE + IN_JOURNAL
-    (fault,) = verify_history(str(store)).faults
+    (fault,) = verify_history(store).faults
     assert (fault.table, loss in fault.problem) == ("event", True)
     assert dengine("verify", store).exit_code == 1
     assert document("verify", store, "--acknowledge", "--author", "Kim")["ok"]
@@ -123,9 +123,9 @@ def test_what_a_killed_process_left_is_no_alarm(store, kind):
     elif kind == "a half":  # of a record that was being written
         half = journal.MARK + b"\x20\0\0\0 half of a rec"
         file.write_bytes(file.read_bytes().rstrip(b"\0") + half)
-    assert verify_history(str(store)).ok
+    assert verify_history(store).ok
     for _ in range(2):
         with DataEngine.open(store) as engine:
             status = engine.status()
             assert (status.alarm, status.labels) == ("", IN_STORE + IN_JOURNAL)
-    assert verify_history(str(store)).ok
+    assert verify_history(store).ok

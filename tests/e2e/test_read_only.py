@@ -68,7 +68,7 @@ def python(*words: str) -> str:
 def stores(tmp_path_factory, make_data):
     """The folder of a store in each state."""
     data, place = make_data(60, samples=80), tmp_path_factory.mktemp("made")
-    with DataEngine("pca", retrain_every=30, store=str(place / "engine.db")) as engine:
+    with DataEngine("pca", retrain_every=30, store=place / "engine.db") as engine:
         learn(engine, data, range(60))
         engine.flush()
         for name, suffixes in LEFT.items():

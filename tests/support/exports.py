@@ -42,11 +42,8 @@ def trained(
     data: Dataset, store: Path | None = None, trace: TraceSpec | None = None, **settings: Any
 ) -> DataEngine:
     """An engine that saw every label and retrained on all of them."""
-    spec, place = (
-        trace or TraceSpec(data.X.shape[-1], rate_hz=500.0, limit=LIMIT),
-        None if store is None else str(store),
-    )
-    engine = DataEngine(recipe=recipe(**settings), store=place, trace=spec, seed=3, replaying=True)
+    spec = trace or TraceSpec(data.X.shape[-1], rate_hz=500.0, limit=LIMIT)
+    engine = DataEngine(recipe=recipe(**settings), store=store, trace=spec, seed=3, replaying=True)
     learn(engine, data, range(len(data)))
     engine.retrain()
     return engine

@@ -34,7 +34,7 @@ def report(version: int, accepted: bool = True) -> RetrainReport:
     )
 
 
-def execute(file: Path, *statements: str) -> None:
+def execute(file: Path | str, *statements: str) -> None:
     """Behind a store's back."""
     with sqlite3.connect(file) as connection:
         for statement in statements:

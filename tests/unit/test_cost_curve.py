@@ -307,8 +307,8 @@ def test_the_verb_shows_a_table_and_writes_the_curve(recordings):
     succeed(*shlex.split(result["command"])[1:])  # it also sets what a new policy would have
     with DataEngine.open("cell.db", reading=True) as engine:
         assert engine.policy == eval(result["python"], {"Policy": Policy})
-    again = document(*WORDS, "--escape", "21")  # other prices, the same replays
-    assert again["costs"]["escape"] == 21
+    # Other prices, the same replays.
+    assert document(*WORDS, "--escape", "21")["costs"]["escape"] == 21
 
 
 def test_the_verb_names_an_option_that_takes_a_list(recordings):

@@ -79,12 +79,12 @@ def test_the_neighbours_are_the_nearest_others_and_their_labels_are_theirs(make_
 
 
 def test_of_a_version_that_is_not_kept_the_record_is_shown_and_no_neighbours(make_data, tmp_path):
-    file = tmp_path / "engine.db"
+    file = f"{tmp_path}/engine.db"
     with played(file, make_data(100, samples=60), RECIPES["pooled"]) as engine:
         past = next(engine.history(reason="uncertain"))
         assert engine.explain(past.decision.id).neighbours
     execute(file, "UPDATE model_version SET state = NULL")
-    with SqlStore(str(file)) as store:
+    with SqlStore(file) as store:
         explanation = explain(store, past.decision.id)
     assert explanation.neighbours == ()
     assert "is not kept any more" in said_of(explanation)
@@ -155,7 +155,7 @@ def test_the_envelope_counts_the_samples_that_leave_it_and_needs_twenty_successe
 def test_a_decision_is_explained_by_the_policy_that_was_in_force_when_it_was_made(
     make_data, tmp_path
 ):
-    store = SqlStore(str(tmp_path / "e.db"), clock=count(1).__next__)
+    store = SqlStore(f"{tmp_path}/e.db", clock=count(1).__next__)
     changes = [{"lower_bound": 0.95}, {"shadow": True}, {"alpha": 0.3}]
     with played(store, make_data(120, samples=60), RECIPES["local"]) as engine:
         (past,) = engine.history(last=1, action="accept")

@@ -73,8 +73,7 @@ def beyond(engine: DataEngine) -> list[int]:
     and the bad ones.
     """
     n, bad = engine.model.rule.evidence.level_counts_since_alarm[0, 0].sum(0).tolist()
-    outcomes = engine.store.labels.outcomes_since(0)
-    reached = [item.success for item in outcomes if item.lower >= 0.9]
+    reached = [item.success for item in engine.store.labels.outcomes_since(0) if item.lower >= 0.9]
     return [n - len(reached), bad - reached.count(False)]
 
 
@@ -99,8 +98,7 @@ def test_where_all_stops_are_known_silence_until_the_next_decision_confirms_a_pa
     for x in stream.X[stream.y == 1][:12]:
         engine.decide(x + np.float32(0.02))
     engine.retrain(wait=False)  # it stores the confirmations that wait first
-    newest = engine.store.versions.newest()
-    assert newest.last_seq == engine.store.labels.outcomes_since(0)[-1].seq
+    assert engine.store.versions.newest().last_seq == engine.store.labels.outcomes_since(0)[-1].seq
 
 
 def test_silence_says_nothing_by_default(stream):
@@ -150,21 +148,21 @@ def test_a_cell_stays_healthy_on_a_store_of_an_earlier_dengine_whose_labels_do_n
     def earlier(*given, overdue_to, seq):
         return NewLabel(*given, seq=seq)
 
-    store = tmp_path / "e.db"
+    store = f"{tmp_path}/e.db"
     with monkeypatch.context() as patch:
         patch.setattr(feedback, "NewLabel", earlier)
         with make(replace(POOLED, label_within=50), store=store) as engine:
             decisions = [engine.decide(x) for x in stream.X[:10]]  # of which nothing is reported
             play(engine, stream, 0, 250)
     execute(store, "ALTER TABLE label DROP COLUMN overdue_to")
-    assert verify_history(str(store)).ok
+    assert verify_history(store).ok
     with DataEngine.open(store, replaying=True) as engine:
         assert engine.safe_mode == ""
         assert engine.store.decisions.overdue_to(50) >= len(decisions)
         answers = [item.seq for item in engine.store.labels.outcomes_since(0, 0, 200)]
         assert answers[-5:] == sorted(answers[-5:])  # not last, in one burst
         engine.report(engine.decide(stream.X[0]).id, True)
-    assert verify_history(str(store)).ok
+    assert verify_history(store).ok
 
 
 def test_a_callback_that_raises_costs_no_label(stream):

@@ -49,14 +49,14 @@ def test_a_store_may_keep_all_or_more_and_never_so_few_that_none_is_left_to_fall
     tmp_path,
 ):
     for keep, numbers in ((None, list(range(1, 13))), (8, [1, 5, 6, 7, 8, 9, 10, 11, 12])):
-        file = str(tmp_path / f"{keep}.db")
+        file = f"{tmp_path}/{keep}.db"
         with SqlStore(file, keep_versions=keep) as store:
             put(store, 12)
             assert kept(store) == numbers
             assert verify_history(file).ok
     for keep in (1, True, 2.5):
         with pytest.raises(StoreError, match="keep_versions of 2 or more"):
-            SqlStore(str(tmp_path / "c.db"), keep_versions=keep)
+            SqlStore(f"{tmp_path}/c.db", keep_versions=keep)
 
 
 def test_an_engine_goes_on_with_the_version_before_and_numbers_the_next_as_if_nothing_was(
@@ -67,13 +67,13 @@ def test_an_engine_goes_on_with_the_version_before_and_numbers_the_next_as_if_no
         learn(engine, data, range(100))
         assert engine.version == 3
     execute(file, "UPDATE model_version SET state = zeroblob(length(state)) WHERE version = 3")
-    with DataEngine.open(str(file)) as engine:
+    with DataEngine.open(file) as engine:
         decision = engine.decide(data.X[101])
         assert engine.version == decision.model_version == 2
         # It trains on the labels that came after version 2.
         assert engine.report(decision.id, True).version == 4
         assert [event.kind for event in engine.store.events.newest()] == ["damaged"]
-    with DataEngine.open(str(file)) as engine:
+    with DataEngine.open(file) as engine:
         assert engine.version == 4
 
 
@@ -86,7 +86,7 @@ def test_a_model_that_is_refitted_is_not_refitted_without_a_trace_that_is_damage
         learn(engine, data, range(50))
         assert engine.version == 1
     execute(file, "UPDATE trace SET data = zeroblob(400) WHERE rowid = 7")
-    with DataEngine.open(str(file), model=AgreeingNeighbours(Policy(0.1, 0.9))) as engine:
+    with DataEngine.open(file, model=AgreeingNeighbours(Policy(0.1, 0.9))) as engine:
         assert (engine.version, engine.model) == (0, None)
         assert [event.kind for event in engine.store.events.newest()] == ["damaged"]
         learn(engine, data, [60])

@@ -52,26 +52,25 @@ def write(store: SqlStore) -> SqlStore:
     store.settings.save({"recipe": "a = 2", "trace": "{}"})
     store.events.put("note", "Prüfung wörtlich")
     for kind, name, success in (("correct", "d6", False), ("forget", "d7", None)):
-        change = Change(kind, kind, {"decisions": [name]}, "kim", (name,), success)
-        store.corrections.apply(change)
+        store.corrections.apply(Change(kind, kind, {"decisions": [name]}, "kim", (name,), success))
     return store
 
 
 @pytest.fixture(scope="module")
 def written(tmp_path_factory):
-    file = tmp_path_factory.mktemp("history") / "engine.db"
-    write(SqlStore(str(file))).close()
+    file = f"{tmp_path_factory.mktemp('history')}/engine.db"
+    write(SqlStore(file)).close()
     execute(file, "PRAGMA wal_checkpoint(TRUNCATE)")
     return file
 
 
 @pytest.fixture
 def file(written, tmp_path):
-    return Path(shutil.copy(written, tmp_path / "engine.db"))
+    return shutil.copy(written, f"{tmp_path}/engine.db")
 
 
-def faults(file: Path) -> list[tuple[str, str]]:
-    return [(fault.table, fault.key) for fault in verify_history(str(file)).faults]
+def faults(file: str) -> list[tuple[str, str]]:
+    return [(fault.table, fault.key) for fault in verify_history(file).faults]
 
 
 def test_what_a_store_wrote_is_whole_in_every_database(place):
@@ -93,7 +92,7 @@ WHEN 'real' THEN {0} * 1.0000001 + 1e-9 ELSE {0} + 1 END"""
 
 
 def test_a_value_changed_in_any_column_of_any_table_is_found(written, tmp_path):
-    rng, missed, tried, file = random.Random(0), [], 0, tmp_path / "changed.db"
+    rng, missed, tried, file = random.Random(0), [], 0, f"{tmp_path}/changed.db"
     with closing(sqlite3.connect(written)) as whole:
         query = "SELECT s.name, c.name FROM sqlite_master s, pragma_table_info(s.name) c"
         columns = whole.execute(f"{query} WHERE s.type = 'table'").fetchall()
@@ -107,43 +106,44 @@ def test_a_value_changed_in_any_column_of_any_table_is_found(written, tmp_path):
                 (row,) = rng.choice(connection.execute(query).fetchall())
                 connection.execute(f"UPDATE {table} SET {name} = {change} WHERE rowid = {row}")
             tried += 1
-            missed += [(table, column)] if verify_history(str(file)).ok else []
+            missed += [(table, column)] if verify_history(file).ok else []
     assert (missed, tried > 60) == ([], True)
 
 
 @pytest.mark.parametrize(
-    ("statement", "named"),
+    ("statement", "table", "key"),
     [
-        ("UPDATE label SET success = NOT success WHERE seq = 3", ("label", "d2")),
-        ("UPDATE decision SET upper = 0.875 WHERE id = 'd7'", ("decision", "d7")),
-        ("UPDATE model_version SET state = zeroblob(9) WHERE retrain = 2", ("model_version", "2")),
-        ("UPDATE correction SET success = 1 WHERE number = 2", ("correction", "2")),
-        ("DELETE FROM correction WHERE number = 1", ("ledger", "entry 22")),
-        ("UPDATE event SET text = 'another' WHERE number = 1", ("event", "1")),
-        ("UPDATE setting SET value = 'a = 3' WHERE key = 'recipe'", ("setting", "recipe")),
-        ("INSERT INTO setting VALUES ('cell', 'more', 'x')", ("setting", "more")),
-        ("INSERT INTO setting VALUES ('cell', x'ff', 'x')", ("setting", "b'\\xff'")),
-        ("""UPDATE ledger SET added = '[[1, 2], ["a", 3]]'""", ("ledger", "entry 3")),
-        ("DELETE FROM label WHERE seq = 4", ("ledger", "entry 15")),
-        ("DELETE FROM event WHERE number = 1", ("ledger", "entry 21")),
-        ("DELETE FROM model_version WHERE retrain = 3", ("ledger", "entry 19")),
-        ("DELETE FROM setting WHERE key = 'trace'", ("setting", "trace")),
-        ("DELETE FROM trace WHERE decision_id = 'd7'", ("trace", "d7")),
-        ("DELETE FROM decision WHERE id = 'd7'", ("decision", "d7")),
-        ("UPDATE ledger SET time = time + 1 WHERE number = 3", ("ledger", "entry 3")),
-        ("DELETE FROM ledger WHERE number = 3", ("ledger", "entry 3")),
+        ("UPDATE label SET success = NOT success WHERE seq = 3", "label", "d2"),
+        ("UPDATE decision SET upper = 0.875 WHERE id = 'd7'", "decision", "d7"),
+        ("UPDATE model_version SET state = zeroblob(9) WHERE retrain = 2", "model_version", "2"),
+        ("UPDATE correction SET success = 1 WHERE number = 2", "correction", "2"),
+        ("DELETE FROM correction WHERE number = 1", "ledger", "entry 22"),
+        ("UPDATE event SET text = 'another' WHERE number = 1", "event", "1"),
+        ("UPDATE setting SET value = 'a = 3' WHERE key = 'recipe'", "setting", "recipe"),
+        ("INSERT INTO setting VALUES ('cell', 'more', 'x')", "setting", "more"),
+        ("INSERT INTO setting VALUES ('cell', x'ff', 'x')", "setting", "b'\\xff'"),
+        ("""UPDATE ledger SET added = '[[1, 2], ["a", 3]]'""", "ledger", "entry 3"),
+        ("DELETE FROM label WHERE seq = 4", "ledger", "entry 15"),
+        ("DELETE FROM event WHERE number = 1", "ledger", "entry 21"),
+        ("DELETE FROM model_version WHERE retrain = 3", "ledger", "entry 19"),
+        ("DELETE FROM setting WHERE key = 'trace'", "setting", "trace"),
+        ("DELETE FROM trace WHERE decision_id = 'd7'", "trace", "d7"),
+        ("DELETE FROM decision WHERE id = 'd7'", "decision", "d7"),
+        ("UPDATE ledger SET time = time + 1 WHERE number = 3", "ledger", "entry 3"),
+        ("DELETE FROM ledger WHERE number = 3", "ledger", "entry 3"),
         (
             "INSERT INTO event VALUES ('cell', 4, 1.0, 'note', 'slipped in', NULL, '', NULL, NULL)",
-            ("event", "4"),
+            "event",
+            "4",
         ),
-        ("UPDATE label SET entry = 2 WHERE seq = 3", ("label", "d2")),
-        ("UPDATE label SET entry = NULL WHERE seq = 3", ("label", "d2")),
-        ("UPDATE ledger SET digest = zeroblob(32) WHERE number = 2", ("ledger", "entry 2")),
+        ("UPDATE label SET entry = 2 WHERE seq = 3", "label", "d2"),
+        ("UPDATE label SET entry = NULL WHERE seq = 3", "label", "d2"),
+        ("UPDATE ledger SET digest = zeroblob(32) WHERE number = 2", "ledger", "entry 2"),
     ],
 )
-def test_what_is_wrong_is_named(file, statement, named):
+def test_what_is_wrong_is_named(file, statement, table, key):
     execute(file, statement)
-    assert named in faults(file)
+    assert (table, key) in faults(file)
 
 
 def test_a_changed_row_with_a_sum_that_fits_is_found_in_its_entry(file):
@@ -155,13 +155,13 @@ def test_a_changed_row_with_a_sum_that_fits_is_found_in_its_entry(file):
         row["sum"] = row_sum("label", row)
         connection.execute("UPDATE label SET success = :success, sum = :sum WHERE seq = 2", row)
     assert faults(file) == [("ledger", f"entry {row['entry']}")]
-    with SqlStore(str(file)) as store:  # as an engine does that opens it, whatever it reads of it
+    with SqlStore(file) as store:  # as an engine does that opens it, whatever it reads of it
         check = store.database.check_integrity
         assert check(100) == check(10) == "the rows of label are not those of the ledger"
         assert check(3) == check(100, since=10) == ""
 
 
-def cut_off(file: Path) -> None:
+def cut_off(file: str) -> None:
     """Remove the newest entry with all that it chains: nothing in the store tells of it."""
     newest = "(SELECT max(number) FROM ledger)"
     execute(file, *(f"DELETE FROM {table} WHERE entry = {newest}" for table in CHAINED))
@@ -171,24 +171,24 @@ def cut_off(file: Path) -> None:
 def test_entries_that_were_cut_off_are_found_by_a_digest_that_was_kept_elsewhere(
     file,
 ):
-    kept = verify_history(str(file)).cells[0].digest
-    with SqlStore(str(file)) as store:
+    kept = verify_history(file).cells[0].digest
+    with SqlStore(file) as store:
         store.events.put("note", "later")
-    assert verify_history(str(file), expect=kept[:12]).ok
+    assert verify_history(file, expect=kept[:12]).ok
     for _ in range(2):
         cut_off(file)
-    assert verify_history(str(file)).ok
-    (fault,) = verify_history(str(file), expect=kept).faults
+    assert verify_history(file).ok
+    (fault,) = verify_history(file, expect=kept).faults
     assert (fault.table, "cut off" in fault.problem) == ("ledger", True)
     with pytest.raises(StoreError, match="64 hexadecimal digits"):
-        verify_history(str(file), expect="newest")
+        verify_history(file, expect="newest")
 
 
 def test_who_has_no_key_cannot_make_a_keyed_ledger_anew(tmp_path, monkeypatch):
-    file, key = tmp_path / "engine.db", str(make_key(tmp_path / "ledger.key"))
+    file, key = f"{tmp_path}/engine.db", str(make_key(tmp_path / "ledger.key"))
     monkeypatch.setenv(KEY_VARIABLE, key)
-    write(SqlStore(str(file))).close()
-    assert verify_history(str(file)).ok
+    write(SqlStore(file)).close()
+    assert verify_history(file).ok
     with sqlite3.connect(file) as connection:  # by somebody who may write, and who has our code
         connection.row_factory = sqlite3.Row
         previous = START
@@ -205,28 +205,28 @@ def test_who_has_no_key_cannot_make_a_keyed_ledger_anew(tmp_path, monkeypatch):
         monkeypatch.setenv(KEY_VARIABLE, named)
         for use in (SqlStore, verify_history):
             with pytest.raises(StoreError, match=f"was begun, or made anew, {text}"):
-                use(str(file))
+                use(file)
     monkeypatch.delenv(KEY_VARIABLE)
-    assert verify_history(str(file)).ok  # which is why it has to be keyed
+    assert verify_history(file).ok  # which is why it has to be keyed
 
 
 def test_pages_that_sqlite_cannot_read_are_said_and_the_rest_is_checked(file):
     with closing(sqlite3.connect(file)) as connection:
         query = "SELECT (rootpage - 1) * page_size FROM sqlite_master, pragma_page_size"
         (begin,) = connection.execute(f"{query} WHERE name = 'event'").fetchone()
-    data = file.read_bytes()
-    file.write_bytes(data[:begin] + bytes(100) + data[begin + 100 :])
+    data = Path(file).read_bytes()
+    Path(file).write_bytes(data[:begin] + bytes(100) + data[begin + 100 :])
     assert {("file", ""), ("event", "")} <= {*faults(file)}
 
 
 def test_another_cells_faults_are_its_own(file):
-    with SqlStore(str(file), "other") as store:
+    with SqlStore(file, "other") as store:
         write(store)
     execute(file, "UPDATE event SET text = 'x' WHERE cell_id = 'other'")
-    assert verify_history(str(file), "cell").ok
-    assert {fault.cell_id for fault in verify_history(str(file)).faults} == {"other"}
+    assert verify_history(file, "cell").ok
+    assert {fault.cell_id for fault in verify_history(file).faults} == {"other"}
     with pytest.raises(StoreError, match="cell, other"):
-        verify_history(str(file), "a third")
+        verify_history(file, "a third")
 
 
 @pytest.mark.parametrize("statement", ["", "CREATE TABLE t (id)"])
@@ -234,17 +234,17 @@ def test_what_is_no_store_is_refused_and_nothing_is_made(statement, tmp_path):
     if statement:
         execute(tmp_path / "a.db", statement)
     with pytest.raises(StoreError, match="Expected a"):
-        verify_history(str(tmp_path / "a.db"))
+        verify_history(f"{tmp_path}/a.db")
     assert (tmp_path / "a.db").exists() == bool(statement)
 
 
 def test_a_damaged_trace_is_left_out_of_training_and_an_event_names_it(file):
-    with SqlStore(str(file)) as store:
+    with SqlStore(file) as store:
         whole = store.labels.with_traces()
     changed, kept = "UPDATE trace SET data = zeroblob(800)", ~np.isin(whole.seq, [4, 5])
     gone = "DELETE FROM trace WHERE decision_id = 'd4'"
     execute(file, f"{changed} WHERE decision_id = 'd3'", gone)
-    with SqlStore(str(file)) as store:
+    with SqlStore(file) as store:
         for _ in range(2):
             result = store.labels.with_traces()
             for name in ("seq", "traces", "labels", "hashes"):
@@ -254,7 +254,7 @@ def test_a_damaged_trace_is_left_out_of_training_and_an_event_names_it(file):
         with pytest.raises(StoreError, match=r"'d3'.*bytes have changed"):
             store.decisions.get("d3")
     execute(file, changed)
-    with SqlStore(str(file)) as store:
+    with SqlStore(file) as store:
         assert len(store.labels.with_traces().traces) == 0
 
 

@@ -26,7 +26,7 @@ from tests.support.stores import decision, label, report, trace
 
 @contextmanager
 def opened(folder: Path) -> Iterator[JournalledStore]:
-    with closing(JournalledStore(SqlStore(str(folder / "cell.db"), wait=10.0), window=10)) as box:
+    with closing(JournalledStore(SqlStore(f"{folder}/cell.db", wait=10.0), window=10)) as box:
         yield box
 
 
@@ -114,7 +114,7 @@ def test_a_journal_that_cannot_be_written_is_tried_again_and_says_why(box, monke
 @pytest.fixture(params=["memory", "file"])
 def either(request, tmp_path):
     """An outbox of each kind."""
-    url = None if request.param == "memory" else str(tmp_path / "cell.db")
+    url = None if request.param == "memory" else f"{tmp_path}/cell.db"
     with closing(open_outbox(SqlStore(url, wait=10.0), window=10)) as box:
         assert isinstance(box, MemoryStore if url is None else JournalledStore)
         yield box
@@ -169,14 +169,14 @@ def test_a_closed_outbox_takes_nothing_and_what_it_took_can_be_read(either, tmp_
         either.check_usable()
     again = either.store
     if isinstance(either, JournalledStore):
-        again = SqlStore(str(tmp_path / "cell.db"))
+        again = SqlStore(f"{tmp_path}/cell.db")
     assert again.decisions.get("a").success is True
     with closing(open_outbox(again, window=10)) as other:
         assert (other.n_decisions, other.number_label()) == (1, 2)
 
 
 def test_labels_of_a_product_are_numbered_by_the_store(tmp_path):
-    store = SqlStore(str(tmp_path / "cell.db"), product="gear", wait=10.0)
+    store = SqlStore(f"{tmp_path}/cell.db", product="gear", wait=10.0)
     with closing(open_outbox(store, window=10)) as box:
         for name, number in (("a", -1), ("b", -2)):
             assert box.number_label() == number
@@ -194,8 +194,7 @@ def test_an_outbox_that_only_reads_says_so_and_stores_a_note(tmp_path):
     with opened(tmp_path) as owner:
         owner.record_decision(stored("a"))
         owner.drain()
-        store = SqlStore(str(tmp_path / "cell.db"))
-        with closing(open_outbox(store, window=10, reading=True)) as reader:
+        with closing(open_outbox(SqlStore(f"{tmp_path}/cell.db"), 10, reading=True)) as reader:
             with pytest.raises(StoreError, match="opened for reading"):
                 reader.check_usable()
             assert reader.find_decision("a").decision.id == "a"

@@ -64,8 +64,7 @@ def test_labels_of_fold_k_move_neither_its_references_nor_any_query_in_space_k(
         other = ModelPrediction(reducer, CLASSIFIER, folds).fit(data.X, y)
         first, second = (model.spaces.embed(queries) for model in (honest, other))
         np.testing.assert_array_equal(second[:, k], first[:, k])
-        references = [model.index.points[:, inside] for model in (honest, other)]
-        np.testing.assert_array_equal(*references)
+        np.testing.assert_array_equal(*[model.index.points[:, inside] for model in (honest, other)])
         assert other.scale[k] == honest.scale[k]
         assert not np.array_equal(second, first)  # the other spaces did see them
 

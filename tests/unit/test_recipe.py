@@ -128,8 +128,7 @@ def test_a_stored_recipe_imports_nothing_to_learn_a_radius():
     text = 'reducer = "nobody_has_this:Class"\n'
     with pytest.raises(StoreError, match="radius, retrain_every; restore the store"):
         Recipe.from_store({"recipe": text})
-    whole = Recipe.from_store({"recipe": text + "radius = 0.3\nretrain_every = 50\n"})
-    assert whole.radius == 0.3
+    assert Recipe.from_store({"recipe": text + "radius = 0.3\nretrain_every = 50\n"}).radius == 0.3
 
 
 @pytest.mark.parametrize(

@@ -165,8 +165,7 @@ def test_what_answers_is_the_components_then_the_heads_then_the_share_of_each_to
 def test_features_of_many_traces_are_those_of_each_to_the_bit():
     X, y = traces(100)
     features = RocketReducer(folds=2).fit(X, y).raw_features
-    pieces = [features(piece) for piece in np.array_split(X, 15)]
-    assert torch.equal(features(X), torch.cat(pieces))
+    assert torch.equal(features(X), torch.cat([features(piece) for piece in np.array_split(X, 15)]))
 
 
 def test_features_that_are_kept_while_the_window_moves_change_nothing():

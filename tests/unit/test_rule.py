@@ -17,7 +17,6 @@ from dengine import (
     INTERVALS,
     Action,
     DataEngine,
-    Dataset,
     Policy,
     Recipe,
     export_torchscript,
@@ -109,29 +108,31 @@ def recipe_with(guarantee: str) -> Recipe:
     return Recipe("pca", radius=0.5, policy=Policy(0.1, 0.9, guarantee=guarantee), retrain_every=40)
 
 
-def good(data: Dataset) -> np.ndarray:
+@pytest.fixture
+def good(data):
+    """A part of the kind that is accepted."""
     return data.X[np.flatnonzero(data.y == 1)[-1]]
 
 
 @pytest.mark.usefixtures("outside")
-def test_a_rule_from_outside_is_named_by_a_recipe_told_of_a_stop_and_restored(data, tmp_path):
+def test_a_rule_from_outside_is_named_by_a_recipe_told_of_a_stop_and_restored(data, good, tmp_path):
     recipe = Recipe.from_toml(recipe_with("fuse:FuseRule").to_toml())
-    url = str(tmp_path / "engine.db")
-    with DataEngine(recipe=recipe, store=url, replaying=True) as engine:
+    file = tmp_path / "engine.db"
+    with DataEngine(recipe=recipe, store=file, replaying=True) as engine:
         drive(engine, data, last=150, confirm=True)
-        accepted = engine.decide(good(data))
+        accepted = engine.decide(good)
         assert accepted.action is Action.ACCEPT
         engine.report(accepted.id, success=False)  # the system stopped
-        paused = engine.decide(good(data))
+        paused = engine.decide(good)
         assert paused.lower >= 0.9  # only the rule holds it back
         assert paused.action is Action.VERIFY
-    with DataEngine.open(url, allow_import=True) as engine:
-        assert engine.decide(good(data)).action is Action.VERIFY
+    with DataEngine.open(file, allow_import=True) as engine:
+        assert engine.decide(good).action is Action.VERIFY
         engine.retrain()
-    with DataEngine.open(url, allow_import=True) as engine:  # now from the version's own state
-        assert engine.decide(good(data)).action is Action.VERIFY
+    with DataEngine.open(file, allow_import=True) as engine:  # now from the version's own state
+        assert engine.decide(good).action is Action.VERIFY
         learn(engine, replace(data, X=np.roll(data.X, 1, axis=1)), range(60))
-        assert engine.decide(good(data)).action is Action.ACCEPT
+        assert engine.decide(good).action is Action.ACCEPT
 
 
 @pytest.mark.usefixtures("outside")
@@ -143,15 +144,15 @@ def test_a_rule_that_does_not_compile_decides_and_is_not_exported(data, tmp_path
 
 
 @pytest.mark.usefixtures("outside")
-def test_a_rule_that_cannot_be_told_verifies_every_part_and_loses_no_label(data, tmp_path):
-    url = str(tmp_path / "engine.db")
-    with DataEngine(recipe=recipe_with("fuse:FailingRule"), store=url, replaying=True) as engine:
+def test_a_rule_that_cannot_be_told_verifies_every_part_and_loses_no_label(data, good, tmp_path):
+    file = tmp_path / "engine.db"
+    with DataEngine(recipe=recipe_with("fuse:FailingRule"), store=file, replaying=True) as engine:
         decisions = [cycle.decision for cycle in drive(engine, data, last=100)]
         assert {decision.action for decision in decisions} == {Action.VERIFY}
         assert {decision.reason for decision in decisions[41:]} == {"model_error"}
         assert len(engine.store.labels.with_traces().labels) == 100
-    with DataEngine.open(url, allow_import=True) as engine:
-        assert engine.decide(good(data)).action is Action.VERIFY
+    with DataEngine.open(file, allow_import=True) as engine:
+        assert engine.decide(good).action is Action.VERIFY
 
 
 @pytest.mark.parametrize(
@@ -188,10 +189,10 @@ def notebook_rule(number: int, action: int, monkeypatch) -> type[DecisionRule]:
 
 
 def test_a_notebook_cell_that_is_run_again_defines_a_rule_that_is_asked_for_itself(
-    data, monkeypatch
+    data, good, monkeypatch
 ):
     for number, action in enumerate((1, 2, 0)):
         rule = notebook_rule(number, action, monkeypatch)(0.2, 0.8)
         model = ModelPrediction("pca", rule=rule, novelty=0.0).fit(data.X, np.ones(len(data)))
-        assert model.decide(good(data)[None])[0] is ACTIONS[action]
+        assert model.decide(good[None])[0] is ACTIONS[action]
         assert isinstance(model.decider(None), torch.jit.ScriptModule)

@@ -203,7 +203,7 @@ class Rule(DecisionRule): ...
 def test_what_a_store_names_is_imported_only_where_its_caller_says_so(
     mine, data, tmp_path, monkeypatch
 ):
-    module, url = tmp_path / "theirs.py", str(tmp_path / "engine.db")
+    module, url = tmp_path / "theirs.py", f"{tmp_path}/engine.db"
     module.write_text(OUTSIDE)
     monkeypatch.syspath_prepend(str(tmp_path))
     a, b = (address(url, cell, "nut") for cell in "ab")

@@ -276,7 +276,7 @@ def test_what_is_no_network_of_features_is_refused_in_a_sentence(network, messag
 def imported(folder: Path, **settings: Any) -> str:
     """A store with 40 labels that were imported, for a network of 24 steps."""
     params = {"folds": 2, "steps": 4, "fit_steps": 20}
-    recipe, url = Recipe("conv", params, retrain_every=1000, **settings), str(folder / "cell.db")
+    recipe, url = Recipe("conv", params, retrain_every=1000, **settings), f"{folder}/cell.db"
     import_labelled(url, Dataset(DATA.X[:40], DATA.y[:40]), recipe)
     return url
 
