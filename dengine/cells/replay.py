@@ -62,7 +62,7 @@ class ReplayCell:
         return None if self.data.part is None else str(self.data.part[self.order[self.position]])
 
     def insert(self) -> NDArray[np.floating]:
-        """Go on to the next trace and return it, (T,) or (channels, T) as in the data set.
+        """Go on to the next trace of `order`; return it, (T,) or (channels, T) as in the data set.
 
         It is float32, and no copy: it shares its memory with the data set. Raise IndexError after
         the last one; the newest part then stays the last one.

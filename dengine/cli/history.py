@@ -290,10 +290,11 @@ def explain(store: str, decision: str, neighbours: int, out: Out | None) -> None
 def _explanation_rows(explanation: Explanation) -> Iterator[tuple[str, str]]:
     """Yield rows of a table, (title, text), that explain a decision.
 
-    They say when the decision was made and by which version, on which part (if it has a number),
-    and why. Then come the notes on what was computed again, and the share of samples that leave the
-    envelope, the band of the known successes; or a sentence that there are too few successes for an
-    envelope. Of several sentences, or notes, only the first has a title.
+    They say when the decision was made and by which version of the model, or that there was no
+    model, on which part (if it has a number), and why. Then come the notes on what was computed
+    again, and the share of samples that leave the envelope, the band of the known successes; or a
+    sentence that there are too few successes for an envelope. Of several sentences, or notes, only
+    the first has a title.
     """
     decision = explanation.decision.decision
     version = decision.model_version

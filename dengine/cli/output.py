@@ -235,7 +235,8 @@ def table_of_records(title: str, records: Iterable[Any], *names: str) -> "Table"
     """Return a rich Table with a row for each record and a column for each of the named fields.
 
     `heading` makes the titles of the columns, and `format_value` the cells. Without records it has
-    the titles only. Raises AttributeError for a field that a record lacks.
+    the titles only. Passwords of database URLs are masked. Print it with `markup=False`, because
+    cells are not escaped. Raises AttributeError for a field that a record lacks.
     """
     return table_of_rows(
         title,

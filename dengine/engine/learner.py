@@ -580,10 +580,11 @@ class Learner:
         is read is checked against the ledger (the store's hash chain); a difference sets the
         outbox's `integrity_error`, after which every part is verified. A version that cannot be
         used is logged, and the present version stays in force (`Peers.put_in_force`). A pinned
-        version or a correction discards a training under way in the executor. A model that cannot
-        change the reference of a peer's correction is not retrained here. After a newer version the
-        new labels are counted from those that it knows. Nothing happens in a cell without a
-        product. Raises StoreError if the store is unavailable.
+        version or a correction discards a training under way in the executor. A correction changes
+        one of the model's references (the labelled traces with which it compares a new one); a
+        model that cannot do so is not retrained here. After a newer version the new labels are
+        counted from those that it knows. Nothing happens in a cell without a product. Raises
+        StoreError if the store is unavailable.
         """
         peers = self._peers
         if peers is None:

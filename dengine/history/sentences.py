@@ -160,8 +160,9 @@ def explain_in_words(
 def _explain_reason(decision: Decision, trace: TraceArray, circumstances: Circumstances) -> str:
     """Return the reason of a decision, as text that follows "Accepted", "Rejected" or "Verified".
 
-    It says so if the force limit or the alarm is not known. Raises SettingError for a part outside
-    the force limits if one of these limits does not fit the trace.
+    Verified is a part that was sent to the check. The text says so if the force limit that the
+    trace leaves, or the alarm that began the safe mode, is not known. Raises SettingError for a
+    part outside the force limits if one of these limits does not fit the trace.
     """
     if decision.reason is Reason.OUTSIDE:
         left = " and ".join(_limits_left(trace, circumstances)) or "which is not known"
@@ -211,11 +212,13 @@ def _bound_sentences(
 ) -> Iterator[str]:
     """Yield the sentences on the labels near a trace, on the bounds, and on their thresholds.
 
-    `circumstances` are the settings of the engine at the decision. If nothing could be accepted or
-    rejected, or the thresholds are unknown, the sentences say so. For a model that the user handed
-    in and that decides by its own method there is one sentence, with its counts and bounds. Under
-    the guarantees "pooled" and "cost" two equal bounds are given as one number, the mean of the
-    heads. An interval is rounded outward to three decimals.
+    They are the bounds of the success rate near the trace. `circumstances` are the settings of the
+    engine at the decision. If nothing could be accepted or rejected, or the thresholds are unknown,
+    the sentences say so. For a model that the user handed in and that decides by its own method
+    there is one sentence, with its counts and bounds. Under the guarantees (rules that decide)
+    "pooled" and "cost" two equal bounds are given as one number, the mean of the success
+    probabilities that the heads of the reducer give, one in each embedding space. An interval is
+    rounded outward to three decimals.
     """
     n = decision.n_success + decision.n_failure
     interval = "{:.3f} to {:.3f}".format(*outward(decision.lower, decision.upper, 3))

@@ -352,7 +352,7 @@ def status(store: SqlStore, last: int = NEWEST, watching: bool = False) -> Statu
     """Read the status of an engine from its store.
 
     A damaged label among those since the newest retrain is left out, and an event is written to the
-    store. The arrays of the newest version are read with `watching`, and also if a rollback, a
+    store. The arrays of the newest version are read for `Status.watch`, and also if a rollback, a
     release or a change of policy made this version. If they are damaged, an event is written, too,
     and those of the version before it are taken.
 
@@ -362,7 +362,8 @@ def status(store: SqlStore, last: int = NEWEST, watching: bool = False) -> Statu
     last : int, default 500
         Number of newest decisions that `Status.newest` counts.
     watching : bool, default False
-        Whether `Status.watch` is computed, too; the arrays of the newest version are read for it.
+        Whether `Status.watch` is computed, too: how close each detector of drift is to an alarm.
+        Without detectors ("local" with stops="some") it is None, and no arrays are read for it.
 
     Returns
     -------

@@ -23,6 +23,7 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 from sklearn.base import clone
+from sklearn.utils import check_consistent_length
 from torch import Tensor, nn
 
 from ..decision.classifier import WilsonRadiusClassifier
@@ -405,8 +406,7 @@ class ModelPrediction(EngineModel):
         y : array of int, shape (n,)
             1 is success, 0 is failure.
         hashes : array of int64, shape (n,), optional
-            `folds.trace_hash` of each trace, which gives its fold; the number of hashes is not
-            checked. None: `folds.content_hash`.
+            `folds.trace_hash` of each trace, which gives its fold. None: `folds.content_hash`.
 
         Returns
         -------
@@ -416,17 +416,18 @@ class ModelPrediction(EngineModel):
         ------
         SettingError
             If the reducer cannot be trained: there are too few traces, or, for some reducers, a
-            single class. If 20 traces or more are all of one part.
+            single class. If 20 traces or more are all of one part, which means of one hash.
         TraceError, DataError
             If X has another shape or no real numbers, or all samples are below 1e-12 but not all
             are 0; and if a label is neither 1 nor 0.
         ValueError
-            If there are not as many labels as traces, and if a sample is NaN. Other errors of a
-            user's transformer are raised as they are.
+            If there are not as many labels or hashes as traces, and if a sample is NaN. Other
+            errors of a user's transformer are raised as they are.
         """
         X = as_traces(X)
         y = as_labels(y)
         hashes = content_hash(X) if hashes is None else np.asarray(hashes, dtype=np.int64)
+        check_consistent_length(X, y, hashes)
         self.spaces = as_reducer(clone(self.reducer), self.folds)
         return self.train(X, y, hashes)
 
@@ -490,9 +491,10 @@ class ModelPrediction(EngineModel):
         `numbers` are the labels' sequence numbers, by which the reducer finds its results again;
         without them a reducer of dengine keeps none. Samples far larger than usual are clipped
         first (`clip_extremes`). Before the first training, if the reducer gives an
-        `untrained_module` and the decision rule is `scriptable`, a decider without references is
-        compiled as well, because the first training has no time for that; the process keeps it as a
-        template (`template_of`). Raises what `template_of` and the reducer raise.
+        `untrained_module` and the decision rule is `scriptable`, a decider (the module that decides
+        on a trace) without references is compiled as well, because the first training has no time
+        for that; the process keeps it as a template (`template_of`). Raises what `template_of` and
+        the reducer raise.
         """
         X = clip_extremes(X)
         encoder = self.spaces.untrained_module(X)

@@ -209,8 +209,9 @@ class DecisionTable(CellTable):
         Decisions are numbered 1, 2, ... in each robot cell. A check is overdue if its decision has
         this or a lower number, asked for the check, and has no label. The number returned is the
         larger of two: the number of the newest decision minus `within`, and the largest
-        `overdue_to` that is stored with a label, which is this number at the time when the rule was
-        updated with the label. It is 0 if nothing can be overdue yet.
+        `overdue_to` that is stored with a label, which is this number at the time when the decision
+        rule was updated with the label; so a check that was overdue then stays so, whatever
+        `within` is. It is 0 if nothing can be overdue yet.
 
         Parameters
         ----------

@@ -109,7 +109,8 @@ class Outbox(ABC):
         If it is set already, or `error` is "", nothing changes, and nothing is logged. Advice for
         the user is added to the text.
 
-        From then on every part must be verified, until the store is opened again.
+        From then on the engine decides VERIFY on every workpiece, without asking the model, until
+        the store is opened again.
         """
         if error and not self.integrity_error:
             self.integrity_error = (

@@ -103,6 +103,15 @@ class _Nosy(TransformerMixin, BaseEstimator):
         return np.asarray(X)[:, :2]
 
 
+@pytest.mark.parametrize("reducer", ["pca", "rocket", "conv"])
+def test_a_label_too_few_is_refused_and_leaves_the_references(data, reducer):
+    model = ModelPrediction(reducer).fit(data.X, data.y)
+    before = model.count(data.X[:5])
+    with pytest.raises(ValueError, match="inconsistent"):
+        model.fit(data.X, data.y[:-1])
+    np.testing.assert_array_equal(model.count(data.X[:5]), before)
+
+
 def test_a_reducer_that_does_not_say_it_uses_labels_is_never_handed_any(data):
     model = ModelPrediction(_Nosy(), CLASSIFIER).fit(data.X, data.y)
     assert model.n_spaces == 1

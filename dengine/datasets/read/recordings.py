@@ -104,7 +104,7 @@ def recording_of(
 
 @instead(UnreadableError, "Expected columns of one length", IndexError, ValueError)
 def kept_rows(table: Table, rows: Mapping[str, RowWords]) -> Table:
-    """Return a table of the rows that are samples, lost ones too.
+    """Return a table of the rows that are samples; rows of lost samples stay, unchanged.
 
     A column takes its words from the rows that the columns before it keep; one of a single cell
     drops no rows. Raises UnreadableError for a word whose meaning is not stated, and for a column
