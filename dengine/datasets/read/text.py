@@ -203,8 +203,13 @@ def _read_plain(
     is_whole = len(frame) == len(table.lines) and isinstance(frame.index, pd.RangeIndex)
     if not is_whole or frame.iloc[:, -1].isin(["", np.nan]).any():  # the end of a cut row
         return None
-    frame = frame.astype(dict.fromkeys(texts, object))  # equal words are one object
-    return replace(table, columns={name: cells.to_numpy() for name, cells in frame.items()})
+    columns = {**table.columns}
+    for name, cells in frame.items():
+        if name in texts:  # equal words are one object
+            columns[name] = np.array(cells.array.categories, dtype=object)[cells.array.codes]
+        else:
+            columns[name] = cells.to_numpy()
+    return replace(table, columns=columns)
 
 
 def _read_strictly(content: bytes, table: Table, form: TextForm) -> Table:
