@@ -28,15 +28,14 @@ def check_description(description: Description) -> None:
     """
     if open_keys := description.open_keys:
         raise DataError(f"Expected a description without ?, still open: {listed(open_keys)}.")
+    limits = {channel.limit for channel in description.channels.values()}
     expect_all(
         {
             "traces.samples, the samples of each trace": description.traces.samples > 0,
             "time.column, since the order is time": (
                 description.order != "time" or description.time.column
             ),
-            "one limit for all channels": (
-                len({channel.limit for channel in description.channels.values()}) == 1
-            ),
+            "one limit for all channels": len(limits) == 1,
         }
     )
     check_forms(description.time, description.text)

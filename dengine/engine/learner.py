@@ -289,7 +289,9 @@ class Learner:
             return None
 
     def _has_labels(self, retrain_every: int) -> bool:
-        """Return whether so many labels are new, and there are as many as a training needs."""
+        """Return whether `retrain_every` labels are new, and the new ones, or those in the training
+        window, are as many as a training needs (`min_traces`).
+        """
         n_new = self.feedback.new_labels
         n_labels = max(n_new, len(self._window))
         return n_new >= retrain_every and n_labels >= self.live.newest.min_traces

@@ -347,8 +347,9 @@ def settings_of(policy: Policy) -> Settings:
     settings = {name: getattr(policy, name) for name in names}
     plain = Policy(**settings, stops="all")
     for name in ("alpha", "audit_rate"):
-        if getattr(policy, name) != getattr(plain, name):
-            settings[name] = getattr(policy, name)
+        value = getattr(policy, name)
+        if value != getattr(plain, name):
+            settings[name] = value
     return settings | ({"stops": "all"} if policy.stops == "all" else {})
 
 

@@ -426,12 +426,12 @@ def embed_in_chunks(module: Callable[[Tensor], Tensor], x: Tensor, size: int) ->
 
 
 class RowCache:
-    """Rows that were computed from traces, and can be found again by the numbers of their labels.
+    """Rows computed from traces, each found again by the number of its trace's label in the store.
 
     Parameters
     ----------
     numbers : array of int64, shape (n,), or None
-        Those of the labels, increasing; None: the cache is empty.
+        Label numbers of the rows, strictly increasing; None: the cache is empty.
     rows : array of float32, shape (n, p)
         An array, since it is pickled at less cost than a tensor.
     """
@@ -443,10 +443,11 @@ class RowCache:
     def update(self, numbers: Ints | None, compute: Callable[[Any], Floats]) -> Floats:
         """Return the rows of these labels, float32 (m, p), and keep them and no others.
 
-        ``compute(index)`` returns the rows that the cache lacks; the index selects them of m. The
-        numbers (m,), at least one, increase and are not -1, which is not checked; the array is
-        kept, not copied, and so are the rows that are returned. None: all rows are computed, and
-        the cache is neither read nor changed.
+        ``compute(index)`` returns the rows that the cache lacks; `index`, a mask (m,) or a slice of
+        all, selects them, perhaps none. `numbers` (m,), at least one, strictly increase and are
+        never -1, which is not checked. `numbers` and the result are kept without a copy: do not
+        change them. If `numbers` is None, all rows are computed, and the cache is neither read nor
+        changed.
         """
         if numbers is None:
             return compute(slice(None))

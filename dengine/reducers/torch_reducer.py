@@ -206,13 +206,14 @@ class TorchReducer(ProbabilityReducer):
         """Train on traces (n, C, T), labels y (n,) 1 or 0, and folds (n,); replace `encoder_`.
 
         It takes `n_steps_due` steps, or fewer if `stop` ends them, and starts from the weights of
-        the last training, or from initial weights the first time. `numbers` (n,), those of the
-        labels, increasing, identify the traces: if `stop` allows no step, a trace keeps the point
-        that it had in the last training. Folds are not checked. Augmentation and randomness are
-        those of `fit_loop`. Returns the points of the traces, float32 (n, d), row i in embedding
-        space ``folds[i]``. Raises the errors of `check_traces`, and SettingError for fewer than two
-        traces outside a fold, and at the first training for fewer than 20 traces, or a parameter,
-        network or checkpoint that cannot be used.
+        the last training, or from initial weights the first time. `numbers` (n,), strictly
+        increasing, are label numbers that identify the traces: if `stop` allows no step, a trace
+        keeps its point of the last training, and a new trace is embedded by the unchanged
+        `encoder_`; this needs `numbers` in both trainings. Folds are not checked. Augmentation and
+        randomness are those of `fit_loop`. Returns the points of the traces, float32 (n, d), row i
+        in embedding space ``folds[i]``. Raises the errors of `check_traces`, and SettingError for
+        fewer than two traces outside a fold, and at the first training for fewer than 20 traces, or
+        a parameter, network or checkpoint that cannot be used.
         """
         traces = self._check_and_initialize(X)
         return self._train(
@@ -305,13 +306,13 @@ class TorchReducer(ProbabilityReducer):
 
         `fit_loop` takes the steps, and its docstring says what they change. Then the networks with
         averaged weights and new statistics of batch normalisation become `encoder_`. But if `stop`
-        allows no step at all, `encoder_` stays, and of the traces that were in the last training,
-        which `numbers` (n,), those of the labels, tell, the points are those of that training; this
-        needs `numbers` in both. `n_steps_left_` becomes 0 if `stop.max_steps` is set, else the
-        number of steps that are missing until training is complete. `labels` (n,) are 1 or 0,
-        `folds` (n,) the folds, 0 to K - 1. Returns the points of the traces, float32 (n, d), row i
-        in embedding space ``folds[i]``. Raises SettingError for fewer than two traces outside a
-        fold; `encoder_` and the counts of steps stay then.
+        allows no step, and this and the last training have `numbers` (n,), `encoder_` stays: traces
+        of the last training, found by number, keep their points, others are embedded by `encoder_`;
+        `n_new_steps_` becomes 0 and `loss_` NaN. `n_steps_left_` becomes 0 if `stop.max_steps` is
+        set, else the number of steps that are missing until training is complete. `labels` (n,) are
+        1 or 0, `folds` (n,) the folds, 0 to K - 1. Returns the points of the traces, float32 (n,
+        d), row i in embedding space ``folds[i]``. Raises SettingError for fewer than two traces
+        outside a fold; `encoder_` and the counts of steps stay then.
         """
         if numbers is not None and self._points.numbers is not None and stop.exhausted(0):
             self.n_new_steps_ = 0
@@ -333,7 +334,10 @@ class TorchReducer(ProbabilityReducer):
 
     @torch.no_grad()
     def _preprocess(self, traces: Floats) -> Tensor:
-        """Average and standardise traces (n, C, T) by `preprocessor_`: float32 (n, C', L)."""
+        """Return traces (n, C, T) averaged and standardised by `preprocessor_`, without gradients.
+
+        They are float32 (n, C', L): C' channels of L samples.
+        """
         x: Tensor = self.preprocessor_(torch.from_numpy(traces))
         return x
 
@@ -389,7 +393,8 @@ class TorchReducer(ProbabilityReducer):
         before the step, the mean over the batch and over the K copies of the network; each copy
         moves by the gradient of its own mean loss.
         """
-        loss = F.binary_cross_entropy_with_logits(self.members_(x), y)  # of logits (B, K)
+        logits = self.members_(x)  # (B, K)
+        loss = F.binary_cross_entropy_with_logits(logits, y)
         optimizer.zero_grad()
         # Members share no weights, so each gets the gradient of its own mean loss.
         (self.folds * loss).backward()  # type: ignore[no-untyped-call]

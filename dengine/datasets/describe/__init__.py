@@ -202,9 +202,9 @@ def read_tables(p: Proposal) -> list[Table]:
     first. Text files of another form move from `p.names` to `p.others`, and `exclude` may be set
     to `?` (`propose_form`). Tables with other column names than the most frequent ones, of equally
     frequent ones those of the largest table, are left out (Parquet files of such tables move to
-    `p.others`), and so are damaged files. `p.is_cut` is set if only the beginning
-    of a file is used. Raises DataError if no file can be read, also because the package that reads
-    such files is missing.
+    `p.others`), and so are damaged files. `p.is_cut` is set if only the beginning of a file is
+    used. Raises DataError if no file can be read, also because the package that reads such files is
+    missing.
     """
     contents = dict[str, bytes]()
     faults = list[Fault]()
@@ -222,9 +222,7 @@ def read_tables(p: Proposal) -> list[Table]:
         raise DataError(f"Expected a table of samples, found none: {faults[0]}.")
     usual = most_frequent([((*t.columns,), sum(map(len, t.columns.values()))) for t in files])
     if p.description.format == "parquet":  # a smaller table may be a listing
-        odd = [table.source for table in files if (*table.columns,) != usual]
-        p.others = [*p.others, *odd]
-        p.names = [name for name in p.names if name not in odd]
+        p.set_aside([table.source for table in files if (*table.columns,) != usual])
     return [table for table in files if (*table.columns,) == usual]
 
 

@@ -123,11 +123,16 @@ def is_counter(column: Column) -> bool:
     """
     steps = column.steps
     usual = float(np.median(steps)) if len(steps) else 0.0
-    is_even = bool((np.abs(steps - usual) <= EVEN * abs(usual)).all())
+    is_even = are_even(steps, usual)
     if COUNTER_NAME.fullmatch(column.name):
         return usual < 0 or not is_even
     is_channel = quantity_of(column.unit) or any(name.search(column.name) for name in FORCES[:2])
     return is_even and usual not in (0, 1) and not is_channel and ANY not in column.name
+
+
+def are_even(steps: Floats, usual: float) -> bool:
+    """Return whether no step differs from the usual one by more than 1 %; True without steps."""
+    return bool((np.abs(steps - usual) <= EVEN * abs(usual)).all())
 
 
 def epoch_of(column: Column) -> str:

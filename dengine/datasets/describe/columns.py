@@ -171,8 +171,9 @@ class Column:
 
 
 def most_frequent(items: Sequence[tuple[Any, int]]) -> Any:
-    """Return the most frequent of the first elements; of equally frequent ones that with the
-    largest size, the second element.
+    """Return the most frequent value of pairs (value, size); among ties, that of the largest size.
+
+    Raises ValueError if there are no pairs.
     """
     counts = Counter(first for first, _ in items)
     return max(items, key=lambda item: (counts[item[0]], item[1]))[0]
@@ -221,6 +222,11 @@ class Proposal:
             self.description = self.description.with_values({key: value})
             if note:
                 self.notes[key] = note
+
+    def set_aside(self, names: Sequence[str]) -> None:
+        """Move these files from `names`, which hold recordings, to `others`."""
+        self.others = [*self.others, *names]
+        self.names = [name for name in self.names if name not in names]
 
     @property
     def unused(self) -> list[Column]:

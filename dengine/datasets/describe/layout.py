@@ -10,14 +10,16 @@ from ...errors import DataError, listed
 from ..description import ANY, UNKNOWN, Channel, TextForm
 from ..read.split import OBJECTS, longest_list, split
 from ..table import Table
-from .clock import EVEN
 from .clock import NAME as CLOCK_NAME
+from .clock import are_even
 from .columns import LEAST_RUN, Column, Proposal, Tables, columns_of
 
 PART_NAME = re.compile(
-    r"(?i)part(?!ition)|serial|serien|matricola|episode|teil(?!schritt|enummer|e?typ)|werkst(?!.*tr(ä|ae?)ger)|barcode|dmc|trial|piece"
+    r"(?i)part(?!ition)|serial|serien|matricola|episode|teil(?!schritt|enummer|e?typ)"
+    r"|werkst(?!.*tr(ä|ae?)ger)|barcode|dmc|trial|piece"
     r"|sample_?id"
-    r"|^(id|run|sn|cycle|shot|nr|no)$|cycle.?(no|nr|id)$|(?<!order)(?<!batch)(?<!shift)(?<!lot)_(id|run|cycle|sn|nr)$"
+    r"|^(id|run|sn|cycle|shot|nr|no)$|cycle.?(no|nr|id)$"
+    r"|(?<!order)(?<!batch)(?<!shift)(?<!lot)_(id|run|cycle|sn|nr)$"
 )
 NUMBER = re.compile(r"\d+(\.\d+)?(e-?\d+)?(?=[\])]?( ?[\[(][^\d\[(]+[\])])?$)")  # as in `F_0.5 [N]`
 LEAST_NUMBERED = 20  # columns with numbers behind one name that are the samples of a part
@@ -78,9 +80,11 @@ def layout_of(p: Proposal, files: Tables) -> str:
 
 
 def has_even_clock(table: Table) -> bool:
-    """Return whether a column that is named like a clock rises in equal steps, 8 or more.
+    """Return whether a column with a clock's name (`CLOCK_NAME`) increases in 8 equal steps or
+    more.
 
-    Steps may differ by 1 % of the median. The rows are then samples.
+    All its cells are numbers, with a decimal point or comma, and a step may differ from the median
+    by 1 %. The rows are then samples.
     """
     import pandas as pd
 
@@ -88,8 +92,8 @@ def has_even_clock(table: Table) -> bool:
         if CLOCK_NAME.search(name):
             texts = pd.Series(cells).astype(str).str.replace(",", ".")
             steps = np.diff(pd.to_numeric(texts, errors="coerce"))
-            usual = np.median(steps) if len(steps) >= LEAST_RUN else 0.0
-            if usual > 0 and (np.abs(steps - usual) <= EVEN * usual).all():
+            usual = float(np.median(steps)) if len(steps) >= LEAST_RUN else 0.0
+            if usual > 0 and are_even(steps, usual):
                 return True
     return False
 

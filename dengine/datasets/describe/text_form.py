@@ -88,9 +88,10 @@ def look(content: bytes, stated: Stated) -> Look:
     data = _first_row(rows[:MOST_LINES], width)
     is_closed = not any(row[-1] for row in rows[data:] if len(row) == width)
     header, units = _head_lines(rows[:data], width - is_closed, stated)
-    words = stated.get("text.header", 0)
-    if isinstance(words, str):
-        header = [line.startswith(words) for line in [*lines[:data], words]].index(True) + 1
+    beginning = stated.get("text.header", 0)
+    if isinstance(beginning, str):
+        found = (i for i, line in enumerate(lines[:data], 1) if line.startswith(beginning))
+        header = next(found, header)
     form = TextForm(encoding, delimiter, header=header, units=units, data=data + 1)
     return Look(form, width, is_closed, "".join(lines[header - 1 : header]), rows[data:])
 
@@ -156,9 +157,10 @@ def _first_row(rows: Rows, width: int) -> int:
 
 
 def is_numbering(cells: Sequence[str]) -> bool:
-    """Return whether 20 cells or more are numbers, and all these rise; other cells are ignored.
+    """Return whether at least 20 cells are numbers that strictly increase; others are ignored.
 
-    They rise in equal steps, or as `natural_key` sorts texts: 9, 10, 12, but not 0.25, 0.5, 1.5.
+    They increase in equal steps (within 1 %), or in the order of `natural_key`, which reads 0.25 as
+    0 and 25, and 0.5 as 0 and 5: 9, 10, 12 pass, and 0.25, 0.5, 1.5 do not.
     """
     numbers = [*filter(NUMBER.fullmatch, cells)]
     if len(numbers) < MOST_NAMES:
@@ -173,19 +175,22 @@ def is_numbering(cells: Sequence[str]) -> bool:
 def _head_lines(rows: Rows, width: int, stated: Stated) -> tuple[int, int]:
     """Return the lines, from 1, of the header and of the units above the samples; 0 for none.
 
-    The header is the last line with at least `width` cells, the number of columns, and a word,
-    which is any cell that is not empty. But if more than half of its words are units, and an
-    earlier line is such a line, too, it is the line of the units, and the earlier one is the
-    header. Before that, two lines are header and units if the second has units only, the first at
-    most half, and all lines from there to the samples have `width` cells. If the header has a unit
-    among its names, or a name twice, and the wide line before it has no empty cell, the line before
-    may be the header instead. DataError is raised then, unless `stated` has the key `text.header`;
-    its value is not used here. A line of dashes is none of these.
+    A candidate is a line of at least `width` cells, the number of columns, of which one is neither
+    empty nor a row of dashes. A candidate of units only, right below a candidate with at most half
+    units, is the line of the units, and the one above it the header, if all lines from there to the
+    last candidate are candidates. If there is no such pair, the header is the last candidate; but
+    if more than half of its cells are units, and there is an earlier candidate, it is the line of
+    the units, and the earlier one the header. Raises DataError, unless `stated` has the key
+    `text.header` (its value is not used here), if a header of this second rule has a unit, or a
+    name twice, and the candidate before it has no empty cell.
 
     rows : the cells of the lines above the samples.
     """
-    wide = {i: row for i, row in enumerate(rows, 1) if len(row) >= width}
-    heads = [i for i, row in wide.items() if not all(map(RULE.fullmatch, row))]
+    heads = [
+        i
+        for i, row in enumerate(rows, 1)
+        if len(row) >= width and not all(map(RULE.fullmatch, row))
+    ]
     shares = {i: _share_of_units(rows[i - 1]) for i in heads}
     for i in reversed(heads):
         if shares[i] == 1 and shares.get(i - 1, 1) <= HALF:
@@ -208,7 +213,7 @@ def _head_lines(rows: Rows, width: int, stated: Stated) -> tuple[int, int]:
 
 
 def _share_of_units(row: Sequence[str]) -> float:
-    """Return the share of units among the cells that are not empty, of which there is one."""
+    """Return the share of units among the cells that are not empty, of which one is needed."""
     words = [*filter(None, row)]
     return sum(is_unit(word) or bool(UNIT_WORDS.fullmatch(word)) for word in words) / len(words)
 
@@ -236,8 +241,7 @@ def propose_form(p: Proposal, contents: Mapping[str, bytes], faults: list[Fault]
     usual = most_frequent([*sizes, ((), 0)])
     same = [name for name, form in forms.items() if form == usual]
     odd = [name for name, form in forms.items() if form != usual]
-    p.others = [*p.others, *odd]
-    p.names = [name for name in p.names if name not in odd]
+    p.set_aside(odd)
     long = [name for name in odd if len(looks[name].rows) >= LEAST_RUN]
     alike = {DIGITS.sub("0", name) for name in long} & {DIGITS.sub("0", name) for name in same}
     if len(long) > 1 or alike:
