@@ -43,8 +43,8 @@ MIN_KEY_BYTES = 16
 def read_key(path: FilePath, error: type[DengineError]) -> bytes:
     """Return the secret key in a file, without line breaks at its end.
 
-    It signs exports, or is the key of a store's ledger. Raises `error` if the file cannot be read,
-    or the key has fewer than 16 bytes.
+    The key signs exported files, or is that of a store's ledger (a chain of checksums over its
+    rows). Raises `error` if the file cannot be read, or the key has fewer than 16 bytes.
     """
     with instead(
         error,

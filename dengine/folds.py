@@ -77,10 +77,10 @@ def content_hash(X: NDArray[np.floating]) -> FoldArray:
 
 
 def part_hash(part: str) -> int:
-    """Hash the number of a part, a text, to a signed 64-bit integer that is never 0.
+    """Hash the number of a part, the text that names it, to a signed 64-bit integer, never 0.
 
-    A hash of 0 would stand for an unknown part, so it becomes 1. Equal texts have equal hashes, in
-    every process. Raises UnicodeEncodeError for a text that is not valid Unicode.
+    A hash of 0 would stand for a part without a number, so it becomes 1. Equal texts have equal
+    hashes, in every process. Raises UnicodeEncodeError for a text that is not valid Unicode.
 
     References
     ----------

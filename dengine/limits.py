@@ -89,10 +89,12 @@ class ForceLimits:
     def parse(cls, text: str) -> ForceLimits:
         """Return the limits that a text START:END:LOW:HIGH describes; `str` writes this text.
 
-        The four numbers are `start`, `end`, `low` and `high` of the class. An empty LOW or HIGH
+        From START to END, in seconds or in values of the channel `along`, the samples must lie
+        between LOW and HIGH (`start`, `end`, `low` and `high` of the class). An empty LOW or HIGH
         means no limit, but not both; START and END must be given. `:channel=1`, `:along=2` and
-        `:reject` may follow in any order, and set the fields of these names. A channel in digits is
-        an index, any other text is a name. Raises SettingError for a text of another form, and for
+        `:reject` may follow in any order, and set the fields of these names: which channel is
+        limited, and whether a part is rejected in place of checked. A channel in digits is an
+        index, any other text is a name. Raises SettingError for a text of another form, and for
         values that `ForceLimits` refuses.
         """
         fields = text.split(":")

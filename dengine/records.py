@@ -214,9 +214,9 @@ class TraceSpec:
     def completed(self, other: "TraceSpec | None") -> "TraceSpec":
         """Return a copy whose unknown rate, units and columns are taken from another `TraceSpec`.
 
-        What this `TraceSpec` states is kept, also each single unit; `limit` and `fit` are never
-        taken. It is returned unchanged if `other` is None or has another number of samples or
-        channels.
+        A `TraceSpec` says what traces look like. What this one states is kept; a unit is taken for
+        each channel that has none; `limit` and `fit` are never taken. It is returned unchanged if
+        `other` is None or has another number of samples or channels.
         """
         if other is None or (self.samples, self.channels) != (other.samples, other.channels):
             return self
@@ -231,8 +231,8 @@ class TraceSpec:
 def stored_trace_spec(settings: Mapping[str, str]) -> TraceSpec | None:
     """Parse the `TraceSpec` among the settings of a store, which are texts by name.
 
-    Returns None if there is none, like before the first trace. Raises StoreError if its text
-    describes no `TraceSpec`.
+    A `TraceSpec` says what traces look like: shape, sampling rate, units. Returns None if there is
+    none, like before the first trace. Raises StoreError if its text describes no `TraceSpec`.
     """
     if "trace" not in settings:
         return None
@@ -426,8 +426,9 @@ def as_outcome(value: Any, owner: str = "") -> Outcome:
 def source_of(decision: Decision, success: bool) -> Source:
     """Return the source of a label, from its decision and the label itself.
 
-    INSPECTION after a reject. After a verification it is AUDIT if the part was audited, else
-    VERIFICATION; after an accept CONFIRMED if the part is good (`success`), else STOP.
+    A source says where a label came from: INSPECTION after a reject. After a check it is AUDIT if
+    the part was drawn at random although the model was certain, else VERIFICATION; after an accept
+    CONFIRMED if the part is good (`success`), else STOP, because a bad part stops the line.
     """
     if decision.action is Action.REJECT:
         return Source.INSPECTION

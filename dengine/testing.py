@@ -87,12 +87,13 @@ QUERIES = toy_traces(20, seed=5)[0]
 def it_embeds_every_trace_in_every_space(reducer: Any) -> None:
     """Assert that `embed`, `transform` and `embed_references` of a trained clone fit together.
 
-    `reducer` must be a scikit-learn estimator. `embed` must return the points of n traces in K
-    embedding spaces of d dimensions: finite float32 of shape (n, K, d), equal for two clones with
-    the same training, with K of 2 or more if labels are used. `transform` must return shape (n, d).
-    `embed_references(X, fold)` must return, for trace i with fold k, the point `embed(X)[i, k]`.
-    None of them may write to the given traces. Too few axes or spaces may raise IndexError instead.
-    `reducer` may be unfitted and stays unchanged.
+    A reducer maps a trace to a point in each of K embedding spaces; space k is trained without the
+    labels of fold k, one of K groups of traces. `reducer` must be a scikit-learn estimator. `embed`
+    must return the points of n traces, with d coordinates each: finite float32 of shape (n, K, d),
+    equal for two clones with the same training, with K of 2 or more if labels are used. `transform`
+    must return shape (n, d). `embed_references(X, fold)` must return, for trace i with fold k, the
+    point `embed(X)[i, k]`. None of them may write to the given traces. Too few axes or spaces may
+    raise IndexError instead. `reducer` may be unfitted and stays unchanged.
     """
     assert isinstance(reducer, BaseEstimator), (
         f"{type(reducer).__name__} is no scikit-learn estimator"
@@ -120,9 +121,11 @@ def it_embeds_every_trace_in_every_space(reducer: Any) -> None:
 def labels_of_a_fold_move_nothing_in_its_space(reducer: Any) -> None:
     """Assert honest counting: the labels of fold k do not influence embedding space k.
 
-    For each k a clone is trained on test traces, twice in a row, with the labels of fold k inverted
-    and shuffled. It must map new traces to the same points of space k, bit for bit, as a clone that
-    was trained with the true labels. `reducer` may be unfitted and stays unchanged.
+    Each trace belongs to one of K folds, and its label is counted only in the embedding space of
+    its fold, so this space must not have learned from it. For each k a clone is trained on test
+    traces, twice in a row, with the labels of fold k inverted and shuffled. It must map new traces
+    to the same points of space k, bit for bit, as a clone that was trained in the same way with the
+    true labels. `reducer` may be unfitted and stays unchanged.
     """
     X, y = toy_traces()
     trained = _train_clone(reducer, times=2)
@@ -143,8 +146,9 @@ def labels_come_only_where_it_says_that_it_uses_them(reducer: Any) -> None:
 
     A transformer that is no `Reducer` must have scikit-learn's tag `target_tags.required` instead.
     Otherwise an engine would pass no labels, and every retrain would fail. A clone is trained on
-    test traces, so `reducer` stays unchanged. If this fails although the reducer declares labels,
-    or fails with labels as well, the error of the training is raised unchanged.
+    test traces, so `reducer` stays unchanged. If the training fails although the reducer declares
+    that it uses labels, or fails with labels as well, the error of the training is raised
+    unchanged.
     """
     X, y = toy_traces()
     try:
@@ -211,15 +215,17 @@ def a_version_answers_as_it_was_trained(reducer: Any) -> None:
     """Assert that a version, a trained model, embeds equally when it is restored or compiled.
 
     Two models with clones of `reducer` are trained from scratch on test traces, the second with
-    opposite labels. As in a retrain, the module that decides for the second may be a copy of the
-    one that was compiled for the first, with weights of its own. The reference points must be
-    finite. For eight of the traces, a reducer that is restored from the trained one's state, or
-    without a state the trained one itself, must give the same points again, two times, within 1e-5
-    times (1 + the coordinate's absolute value). So must the decider, by which an engine decides,
-    for each trace alone, unless it finds a fault in the trace: within 1e-3 in place of 1e-5, after
-    points are divided by the scale of their space. The decider runs the reducer's `module()`,
-    compiled to TorchScript, or `embed` if that is None. If the module does not compile or run,
-    TorchScript's own error is raised. `reducer` may be unfitted and stays unchanged.
+    opposite labels. The reference points, which are the embeddings of these traces, must be finite.
+    Then eight of the traces are embedded again. A reducer that is restored from the trained one's
+    state, or without a state the trained one itself, must give the same points, two times, within
+    1e-5 times (1 + the coordinate's absolute value). The decider, the module by which an engine
+    decides, must give them within 1e-3 in place of 1e-5, for each trace alone, unless it finds a
+    fault in the trace. Its points are compared after division by one number for each embedding
+    space, the scale of the space. The decider runs the reducer's `module()`, compiled to
+    TorchScript, or `embed` if that is None. As in a retrain, the decider of the second model may be
+    a copy of the one that was compiled for the first, with weights of its own. If the module does
+    not compile or run, TorchScript's own error is raised. `reducer` may be unfitted and stays
+    unchanged.
     """
     X, y = toy_traces()
     for labels in (y, 1 - y):
@@ -231,12 +237,12 @@ def a_version_answers_as_it_was_trained(reducer: Any) -> None:
 def an_engine_resumes_with_identical_decisions(reducer: Any) -> None:
     """Assert that an engine that is closed and opened again decides the same, bit for bit.
 
-    It runs 90 cycles on test traces, with a clone of `reducer` and a store in a temporary folder.
-    Its first retrain must be accepted; if there is none, since `min_traces` of the reducer is above
-    90, IndexError is raised. Its decisions on 20 further traces, made before the closing and again
-    after it, must be equal but for their ids. So a reducer whose `get_state` returns arrays must be
-    restored from them exactly. `reducer` may be unfitted and stays unchanged. The engine limits
-    this thread to one torch thread.
+    It runs 90 cycles (one part each) on test traces, with a clone of `reducer` and a store in a
+    temporary folder. Its first retrain must be accepted (the model put in force); if there is none,
+    since `min_traces` of the reducer is above 90, IndexError is raised. Its decisions on 20 further
+    traces, made before the closing and again after it, must be equal but for their ids. So a
+    reducer whose `get_state` returns arrays must be restored from them exactly. `reducer` may be
+    unfitted and stays unchanged. The engine limits this thread to one torch thread.
     """
     X, y = toy_traces(110)
     recipe = Recipe(clone(reducer), policy=Policy(0.2, 0.8), retrain_every=70, folds=FOLDS)

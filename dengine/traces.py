@@ -37,8 +37,9 @@ def as_trace(trace: Any, trace_spec: TraceSpec | None) -> TraceArray:
         Of any real dtype, or booleans. Without an axis of channels it has one channel. A value too
         large for float32 becomes an infinity.
     trace_spec : TraceSpec or None
-        What the trace must look like. Another length is fitted as `trace_spec.fit` says, into a
-        copy. None: any shape with no more channels than samples, and with at least one sample.
+        What the trace must look like. Another length is fitted as `trace_spec.fit` says (cut, pad
+        or resample; strict allows none), into a copy. None: any shape with no more channels than
+        samples, and with at least one sample.
 
     Returns
     -------
@@ -75,8 +76,8 @@ def as_traces(X: ArrayLike, trace_spec: TraceSpec | None = None) -> TraceArray:
         Of any real dtype, or booleans. n may be 0, but not the other axes. (n, samples) has one
         channel. A value too large for float32 becomes an infinity.
     trace_spec : TraceSpec, optional
-        What the traces must look like; another length is fitted as `trace_spec.fit` says. None: any
-        shape, also one with more channels than samples.
+        What the traces must look like; another length is fitted as `trace_spec.fit` says (cut, pad
+        or resample; strict allows none). None: any shape, also one with more channels than samples.
 
     Returns
     -------
@@ -196,8 +197,8 @@ def _match_spec(x: TraceArray, trace_spec: TraceSpec) -> TraceArray:
     """Return traces (..., C, T) fitted to the number of samples of a `TraceSpec`.
 
     Traces of that length are returned as they are; of others a fitted copy is returned, as
-    `trace_spec.fit` says. Raises TraceError for a length that cannot be fitted so, and for another
-    number of channels.
+    `trace_spec.fit` says (cut, pad or resample; strict allows none). Raises TraceError for a length
+    that cannot be fitted so, and for another number of channels.
     """
     channels, samples = x.shape[-2:]
     if channels != trace_spec.channels:
@@ -278,7 +279,7 @@ class TraceGate(nn.Module):
         self.register_buffer("weights", torch.from_numpy(hash_weights(size)))
 
     def forward(self, x: Tensor, limit: float = float("inf")) -> tuple[int, int]:
-        """Find the first fault of a trace, with `limit` as the sensor's range, and its hash.
+        """Find the first fault of a trace, and hash its samples; `limit` is the sensor's range.
 
         Parameters
         ----------
@@ -320,9 +321,9 @@ class TraceGate(nn.Module):
 def check_rate(force_limits: Sequence[ForceLimits], trace_spec: TraceSpec | None) -> None:
     """Raise SettingError if a force limit is in seconds and the rate of the traces is unknown.
 
-    If `trace_spec` is None, the rate is unknown, too: the `TraceSpec` will be inferred from the
-    first trace, which does not tell its rate. A limit `along` a channel, in place of time, needs no
-    rate.
+    Force limits are an operator's limits of a channel within a stretch of time, or of the values of
+    another channel, `along`; the latter need no rate. If `trace_spec` is None, the rate is unknown,
+    too: the `TraceSpec` will be inferred from the first trace, which does not tell its rate.
     """
     in_seconds = [limits for limits in force_limits if limits.along is None]
     if in_seconds and (trace_spec is None or trace_spec.rate_hz is None):
@@ -385,13 +386,13 @@ class ForceLimitsGate(nn.Module):
         self.register_buffer("time", time)  # (1, T)
 
     def forward(self, x: Tensor) -> int:
-        """Check a trace (C, T) of float32.
+        """Check whether a trace, float32 (C, T), keeps the operator's limits of its channels.
 
         Returns WITHIN_LIMITS (-1) if it keeps all limits, or if there are none; else the
         `ActionCode`: 2 (REJECT) if it leaves a limit with `reject`, otherwise 0 (VERIFY). A limit
-        holds in a stretch, from `start` to `end` of the time, or of the channel `along`; a trace
-        that has no sample in the stretch leaves the limit. A value that is NaN leaves no limit; a
-        sample whose value in the channel `along` is NaN lies in no stretch.
+        bounds the values of a channel in a stretch, from `start` to `end` of the time, or of the
+        channel `along`; a trace that has no sample in the stretch leaves the limit. A value that is
+        NaN leaves no limit; a sample whose value in the channel `along` is NaN lies in no stretch.
         """
         if self.limits.size(0) == 0:
             return self.within

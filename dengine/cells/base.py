@@ -48,9 +48,10 @@ class Cell(Protocol):
 def check_cell(cell: Any) -> None:
     """Raise SettingError for an object that lacks a method of `Cell`; no method is called.
 
-    The message names the missing methods. An attribute that `inspect.getattr_static` finds counts
-    as a method unless it is None; it is not read, so that no code of the robot cell runs. An
-    attribute that is not found in this way is read and must be callable.
+    The methods are insert, verify, proceed and reject; the message names the missing ones. An
+    attribute that `inspect.getattr_static` finds counts as a method unless it is None; it is not
+    read, so that no code of the robot cell runs. An attribute that is not found in this way is read
+    and must be callable.
     """
     # Static look-up first: a cell may react to the reading of its attributes.
     missing = [

@@ -62,10 +62,11 @@ class ReplayCell:
         return None if self.data.part is None else str(self.data.part[self.order[self.position]])
 
     def insert(self) -> NDArray[np.floating]:
-        """Go on to the next trace of `order`; return it, (T,) or (channels, T) as in the data set.
+        """Go on to the next recorded trace; return it, (T,) or (channels, T) as in the data set.
 
-        It is float32, and no copy: it shares its memory with the data set. Raise IndexError after
-        the last one; the newest part then stays the last one.
+        `order`, with which the robot cell was made, says which trace is next. The trace is float32,
+        and no copy: it shares its memory with the data set. Raise IndexError after the last one;
+        the newest part then stays the last one.
         """
         if self.position + 1 >= len(self.order):
             raise IndexError(f"The recording has {len(self.order)} cycles, and all were played.")

@@ -48,11 +48,10 @@ class Verbs(click.Group):
     """
 
     def main(self, *args: Any, **options: Any) -> Any:
-        """Parse the arguments and run a subcommand, like `click.Group.main`, whose arguments it
-        takes; it usually ends the process.
+        """Parse the arguments, run a subcommand, and usually end the process.
 
-        Before that stdout and stderr, unless they are in UTF, are set to print "?" for a character
-        that their encoding lacks.
+        The arguments are those of `click.Group.main`. Before that stdout and stderr, unless they
+        are in UTF, are set to print "?" for a character that their encoding lacks.
         """
         for stream in (sys.stdout, sys.stderr):
             if isinstance(stream, TextIOWrapper) and not stream.encoding.lower().startswith("utf"):
@@ -60,16 +59,16 @@ class Verbs(click.Group):
         return super().main(*args, **options)
 
     def invoke(self, ctx: click.Context) -> Any:
-        """Run a subcommand of `dengine` and return its result; raise its expected errors as
-        `click.ClickException`, exit code 1.
+        """Run a subcommand and return its result; raise its expected errors as errors of click.
 
-        Expected are DengineError, OSError (but BrokenPipeError, which passes) and UnicodeError. An
-        ImportRefusedError, which `--allow-import` avoids, becomes `click.UsageError`, exit code 2.
+        Expected are DengineError, OSError (but BrokenPipeError, which passes) and UnicodeError;
+        they become `click.ClickException`, exit code 1. An ImportRefusedError, for a class of the
+        user's that is imported only with `--allow-import`, becomes `click.UsageError`, exit code 2.
         The message is put on one line, and names the options of the command line in place of
         Python's arguments. Passwords are masked, also in the messages of click's own errors, which
-        are raised again. The current folder is added to the end of `sys.path`, so that
-        `module:Class` is found there. Ctrl-C ends the process with exit code 130. Other exceptions
-        pass unchanged.
+        are raised again. The current folder is added to the end of `sys.path`, so that a class that
+        is named as `module:Class` is found there. Ctrl-C ends the process with exit code 130. Other
+        exceptions pass unchanged.
         """
         folder = str(Path.cwd())
         if folder not in sys.path:

@@ -59,17 +59,18 @@ def data(
     """Describe recordings, and list what is wrong with them.
 
     DATA is a folder of files, one for each insertion, or a file with many: text, Parquet, JSON,
-    .npz, .ts or .mcap. The subcommand shows the saved description or, without one, a proposal, in
-    which ? marks what you have to state with --set. While a ? is left, no recording is read by the
-    description, no picture is drawn, and --check ends with exit code 1; --save writes the
-    description all the same. Below, it shows what was read by the description. --out draws the
-    traces, and how they drift. Look at them, and write the description with --save, because every
-    other subcommand needs it to read the recordings; it replaces a file that exists only with
-    --force.
+    .npz, .ts or .mcap. A description, a TOML file, says how the recordings are read. The subcommand
+    shows the saved description or, without one, a proposal, in which ? marks what you have to state
+    with --set. While a ? is left, no recording is read by it, no picture is drawn, and --check ends
+    with exit code 1; --save writes the description all the same. Below the description it shows
+    what was read: the counts of traces and labels, and the recordings that were left out, with the
+    reasons. --out draws the traces, and how they drift. Look at them, and write the description
+    with --save, because every other subcommand needs it to read the recordings; --save replaces a
+    file that exists only with --force.
 
-    DATA may also be a source that needs no description: a bundled set, the file of a store, or an
-    .npz file with X (traces, samples) and y (1 success, 0 failure). For such a source --save does
-    nothing.
+    DATA may also be a source that needs no description: a bundled set (data that come with
+    dengine), the file of a store (an engine's database), or an .npz file with X (traces, samples)
+    and y (1 success, 0 failure). For such a source --save does nothing.
     """
     from ..datasets.description import Seen
     from ..datasets.sample import write_sample
@@ -116,8 +117,9 @@ def data(
 def _print_open_keys(source: DataChoice, description: "Description", path: Path | None) -> None:
     """Print a description with `?` in it, and the keys that the user must state, with their notes.
 
-    A note says what is open about the key; without one it is "not known". With `--json` a document
-    with the data's name, the description and these keys is printed instead.
+    A description says how recordings are read, and a note what is open about a key of it; without
+    one the text is "not known". With `--json` a document with the data's name, the description and
+    these keys is printed instead.
 
     Parameters
     ----------
@@ -142,10 +144,12 @@ def _print_open_keys(source: DataChoice, description: "Description", path: Path 
 def _survey_parts(dataset: "Dataset", survey: "Survey") -> Iterator[Any]:
     """Yield what `dengine data` prints of a data set and its survey: a table, and texts.
 
-    These are the survey's counts with the first and last trace, the notes of the data set, a
-    sentence if the order of recording is unknown, one if more than 25 of the newest usable traces
-    nearly repeat another, and a warning if the tolerance of the default policy is too wide
-    (accepting every part of the data set would meet it), else "". The data set must have a trace.
+    First comes a table with the counts of the survey, such as labels and faults, and with the first
+    and the last trace. Then come the notes of the data set, a sentence if the order of recording is
+    unknown, and a sentence if more than 25 of the newest usable traces (finite, not constant, not
+    too large) nearly repeat the trace of another part. The last text is a warning if accepting
+    every part of the data set would meet the tolerance of the default policy, the share of accepted
+    parts that may be bad; else it is "". The data set must have a trace.
     """
     from ..datasets.checks import tolerance_note
     from ..decision.policy import Policy
@@ -181,10 +185,11 @@ def _save(
 
 
 def _trace_line(dataset: "Dataset", i: int) -> str:
-    """Return a text on trace `i` of a data set: the file or row that it comes from, if known, its
-    label, and its first three and last two samples.
+    """Return a text on trace `i` of a data set: its source, its label and five of its samples.
 
-    Of several channels, these are the samples of the first. Samples have 4 significant digits.
+    The source is the file or row that it comes from, and is left out if it is unknown. The samples
+    are the first three and the last two, with 4 significant digits, of several channels those of
+    the first.
     """
     trace = dataset.cube[i, 0]
     samples = [f"{value:.4g}" for value in (*trace[:3], *trace[-2:])]
@@ -259,16 +264,19 @@ def train(
     Each trace counts once, however often its file is imported. A faulty trace (not finite,
     constant, at the sensor's limit or too large) is stored, but never trained on. A label that
     contradicts the stored label of its trace is left out, and counted in the output; a recording
-    that cannot be read is left out with a note. A store that has been used has its own recipe and
-    seed: leave these options out, because other values are refused. Recordings are brought to the
-    length of the store's traces. If there is a version, no label is new to it, and it lacks no
-    training step (a step of the optimizer), nothing is trained. Otherwise a version that a rollback
-    pinned is released first. If training needs more time than the recipe's time budget, several
-    retrains follow each other. The exit code is 1 if a new version is dropped (the retrain fails,
-    cannot be stored, or has no label to train on), or if training steps are missing at the end,
-    because ten retrains in a row had no time for a single step. If steps are missing, and after
-    Ctrl-C, which keeps what was imported, the same command continues there. The subcommand is
-    refused while an engine runs on the robot cell.
+    that cannot be read is left out with a note. A store that has been used has its own recipe (all
+    settings of the engine) and seed: leave these options out, because other values are refused.
+    Recordings are brought to the length of the store's traces.
+
+    If there is a version (a trained model), no label is new to it, and it lacks no training step (a
+    step of the optimizer), nothing is trained. Otherwise a version that `dengine rollback` pinned,
+    so that no automatic retrain replaces it, is pinned no more. If training needs more time than
+    one retrain may take (the recipe's time budget), several retrains follow each other. The exit
+    code is 1 if a new version is dropped, which leaves the one before in use (the training or a
+    test of it fails, it cannot be stored, or there is no label to train on), or if training steps
+    are missing at the end, because ten retrains in a row had no time for a single step. If steps
+    are missing, and after Ctrl-C, which keeps what was imported, the same command continues there.
+    The subcommand is refused while an engine runs on the robot cell.
     """
     from ..datasets.importing import import_labelled, in_form_of
     from ..engine.engine import DataEngine

@@ -60,24 +60,29 @@ def export(
 ) -> None:
     """Write an engine's decision to a file for the controller.
 
-    FILE.sha256, the checksum, is written beside it, and with a key also FILE.sig, the signature. If
-    any of these three exists, --force is needed; without a key, --force removes an old FILE.sig. An
-    existing key is never replaced. --cpp writes the C and C++ sources that run such a file.
+    FILE, the --out, holds the whole decision: the model, its references (the labelled traces that
+    it compares with) and the rule. FILE.sha256, the checksum, is written beside it, and with a key
+    also FILE.sig, the signature. If any of these three exists, --force is needed; without a key,
+    --force removes an old FILE.sig. An existing key is never replaced. --cpp writes the C and C++
+    sources that run such a file.
 
-    STORE is the engine's store, as given to `dengine train` or `dengine run`; the robot cell may
-    run meanwhile, and an event records the export. But the exported file never learns the outcome
-    of a part that was accepted and whose outcome is not known yet. Before the first retrain there
-    is nothing to export, and the exit code is 1. It is 1, too, for a model that you handed in, for
-    an interval other than wilson and binomial, and for a reducer or rule that runs in Python only,
-    like umap-learn or a scikit-learn transformer. For onnx it is also 1 if the engine audits, is in
-    shadow mode, has force limits or another guarantee than local with stops some, or has a part
-    among its references more than once. STORE needs --out, and --out needs STORE; --make-key and
-    --cpp need neither.
+    STORE is the engine's store (its database), as given to `dengine train` or `dengine run`; the
+    robot cell may run meanwhile, and an event in the store's log records the export. But the
+    exported file never learns the outcome of a part that was accepted and whose outcome is not
+    known yet. Before the first retrain there is nothing to export, and the exit code is 1. It is 1,
+    too, for a model that you handed in, for an interval other than wilson and binomial, and for a
+    reducer or rule that runs in Python only, like umap-learn or a scikit-learn transformer. For
+    onnx it is also 1 if the engine audits (checks some parts of which the model is certain), is in
+    shadow mode (checks every part), has force limits (limits of the force that an operator set),
+    has another guarantee (rule of its decisions) than local, or stops all (every bad accepted part
+    stops the line), or has a part among its references more than once. STORE needs --out, and --out
+    needs STORE; --make-key and --cpp need neither.
 
-    If --make-key is given together with STORE and --out, the new key also signs FILE; so
-    --key and --make-key exclude each other. Whoever has the key can check an exported file, and can
-    also sign one. The output names the files, the version and its number of references. The key
-    comes first, then the sources, then FILE; if one of them fails, what was written before stays.
+    If --make-key is given together with STORE and --out, the new key also signs FILE; so --key and
+    --make-key exclude each other. Whoever has the key can check an exported file, and can also sign
+    one. The output names the files, the version (the number of the trained model) and how many
+    references it has. The key comes first, then the sources, then FILE; if one of them fails, what
+    was written before stays.
     """
     if (store is None) is not (out is None) or not (store or new_key or cpp):
         raise click.UsageError(

@@ -101,14 +101,15 @@ class Moment(click.ParamType):  # type: ignore[type-arg]  # click made it generi
 def history(store: str, events: bool, **criteria: Any) -> None:
     """Show the decisions of a store, newest last.
 
-    STORE is the file or URL of an engine's store, and must exist. The options choose which
-    decisions; --events adds the retrains and events since the first of these decisions (if no
-    decision fits, all), or since --since, and before --until. In the table part has the last 10
-    characters of the part's number, model is what the model alone would have done, if that differs
-    from the action, good and bad are the labels that were counted, bound is the interval of the
-    success rate that follows from them, v is the version of the model, and label is what the part
-    turned out to be. If there is nothing to list, a sentence says so. `dengine explain` tells more
-    about one decision.
+    STORE is the file or URL of an engine's store (its database), and must exist. The options choose
+    which decisions. --events adds the retrains, and the events (what else happened, such as a
+    change of the policy), from the time of the first of these decisions on (if no decision fits,
+    all), or from --since on, and before --until. In the table part has the last 10 characters of
+    the part's number, model is what the model alone would have done, if that differs from the
+    action, good and bad are the numbers of labels nearby that were counted, bound is the interval
+    of the success probability that follows from them, v is the version of the model, and label is
+    what the part turned out to be. If there is nothing to list, a sentence says so. `dengine
+    explain` tells more about one decision.
     """
     from ..history.status import history as read_history
     from ..representation import to_jsonable
@@ -137,9 +138,10 @@ def history(store: str, events: bool, **criteria: Any) -> None:
 def _label_text(stored: StoredDecision) -> str:
     """Return a decision's label, and how it became known, as text: "good verified", "bad stop".
 
-    A corrected label is shown as corrected, but with the source of the first report; only a
-    confirmed part that was corrected to bad has the source "stop". The text is "-" if there is no
-    label, or if the label was forgotten.
+    A corrected label is shown as corrected, but with the source of the first report. The one
+    exception: an accepted part that was reported as good and then corrected to bad has the source
+    "stop" (the part stopped the line). The text is "-" if there is no label, or if a person
+    withdrew it.
     """
     if stored.success is None:
         return "-"
@@ -156,7 +158,7 @@ def _model_text(stored: StoredDecision) -> str:
 
 
 def _bound_text(stored: StoredDecision) -> str:
-    """Return the interval of a decision's success rate as text, such as 0.81-0.97.
+    """Return the interval of a decision's success probability as text, such as 0.81-0.97.
 
     It has two decimals and is rounded outward; "-" if the decision has no interval.
     """
@@ -186,9 +188,10 @@ def _history_table(items: Sequence[StoredDecision | StoredVersion | Event]) -> s
     """Return a table of decisions as text, in the order of the items.
 
     It has a row for each decision, with the columns in `COLUMNS`, from its time to its label.
-    Retrains and events are lines between its rows, cut to 119 characters; the rows are not cut, but
-    of a part's number they have only the last 10 characters. Two lines of titles come first, also
-    if no item is a decision. Without any item the text is a sentence that says so.
+    Retrains (`StoredVersion`) and events, which say what else happened, are lines between its rows,
+    cut to 119 characters; the rows are not cut, but of a part's number they have only the last 10
+    characters. Two lines of titles come first, also if no item is a decision. Without any item the
+    text is a sentence that says so.
     """
     from ..store.records import StoredDecision
 
@@ -214,9 +217,9 @@ def _history_table(items: Sequence[StoredDecision | StoredVersion | Event]) -> s
 def _event_line(item: StoredVersion | Event) -> str:
     """Return the line of an event or a retrain: its time in UTC, what happened, and why.
 
-    The line of a retrain also has the number of traces and the duration; it names the version that
-    was put in force, or, if the retrain was dropped, the number of the retrain. The text of an
-    event is put on one line.
+    The line of a retrain also has the number of traces and the duration; it names the version of
+    the model that came into use, or, if the retrain was dropped (its model is not used), the number
+    of the retrain. The text of an event is put on one line.
     """
     from ..store.records import Event
 
@@ -246,12 +249,14 @@ def explain(store: str, decision: str, neighbours: int, out: Out | None) -> None
     The decision is named by its id, as `dengine history STORE` lists it, by its part's number, or
     by the word last, for the newest. If a part has several decisions that are no rejects, or
     several rejects and nothing else, its number is refused with exit code 1; the message has their
-    ids. Only the newest 20 decisions on the part are looked at. A decision that is not in the
-    store is refused, too, and so is one whose trace, or a neighbour's, is damaged. Counts, bound
-    and action are shown as they were recorded. Neighbours are searched again with the version that
-    decided, if the store still has it. The picture of --out shows the trace with its neighbours and
-    with the band that holds 95 % of the known successes. Damaged labels, and damaged traces of this
-    band, are left out, and an event in the store records this.
+    ids. Only the newest 20 decisions on the part are looked at. A decision that is not in the store
+    is refused, too, and so is one whose trace is damaged, or the trace of one of its neighbours,
+    the labelled traces nearest to it. The counts of labels nearby, the bound (the interval of the
+    success probability) and the action are shown as they were recorded. Neighbours are searched
+    again with the version (the trained model) that decided, if the store still has it. The picture
+    of --out shows the trace with its neighbours and with the band that holds the middle 95 % of the
+    known good traces. Damaged labels, and damaged traces of this band, are left out, and an event
+    in the store's log records this.
     """
     from ..errors import ReportError
     from ..experiments.figures import explained_picture
@@ -291,10 +296,11 @@ def _explanation_rows(explanation: Explanation) -> Iterator[tuple[str, str]]:
     """Yield rows of a table, (title, text), that explain a decision.
 
     They say when the decision was made and by which version of the model, or that there was no
-    model, on which part (if it has a number), and why. Then come the notes on what was computed
-    again, and the share of samples that leave the envelope, the band of the known successes; or a
-    sentence that there are too few successes for an envelope. Of several sentences, or notes, only
-    the first has a title.
+    model, on which part (if it has a number), and why. Then come the notes, which say with which
+    version its neighbours (the nearest labelled traces) were searched again, or why none are shown.
+    The last row is the share of samples that leave the envelope, the band of the known good traces,
+    or says that there are too few of these. Of several sentences, or notes, only the first has a
+    title.
     """
     decision = explanation.decision.decision
     version = decision.model_version

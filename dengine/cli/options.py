@@ -67,8 +67,9 @@ def names_of(kind: str) -> tuple[str, ...]:
     ----------
     kind : str
         guarantee (the decision rule), interval, stops (which bad accepted parts stop the system),
-        recipe, method (recipes and baselines), fit (what is done with live traces of another
-        length), label, action or reason (of a decision). Any other kind is a KeyError.
+        recipe (a named set of all settings), method (a recipe or a baseline, a published method for
+        comparison), fit (what is done with live traces of another length), label, action or reason
+        (of a decision). Any other kind is a KeyError.
     """
     from ..decision.intervals import INTERVALS
     from ..decision.policy import RULES, Stops
@@ -200,10 +201,10 @@ def drop_none(**values: Any) -> Values:
 
 
 def _address(store: str | None, cell_id: str | None, product: str | None = None) -> str | None:
-    """Return a store's address: its file or URL, or a `CellAddress` if a robot cell or product is
-    named.
+    """Return a store's address: its file or URL, or a `CellAddress` that also names a robot cell.
 
-    A `CellAddress` has the file or URL and these names; if only a product is named, the cell is
+    It is a `CellAddress` if a robot cell or a product (the kind of part that several cells make) is
+    given; it has the file or URL and both names. If only a product is given, the cell is named
     "cell". The address is None without a store; a cell or product is a usage error then.
     """
     from ..store.records import address
@@ -238,9 +239,10 @@ store_argument = existing_store(click.argument("store", metavar="STORE"))
 def store_option(text: str, *names: str, required: bool = False) -> Option:
     """Return a decorator that adds `--store`, `--cell-id` and `--product` to a subcommand.
 
-    The subcommand gets them as one address, its argument `store`; whether the store exists is not
-    checked. The address is None without `--store`. A robot cell or product without `--store` is a
-    usage error.
+    The subcommand gets them as one address, its argument `store`: the file or URL, with the names
+    of a robot cell and of its product (the kind of part that several cells make) if one is given.
+    Whether the store exists is not checked. The address is None without `--store`. A cell or
+    product without `--store` is a usage error.
 
     Parameters
     ----------
@@ -296,10 +298,12 @@ class RecipeChoice:
     def load_if_given(self, store: str | None) -> Recipe | None:
         """Return the recipe if a name or a setting was given; None means the store's own recipe.
 
-        It is what `make_contender` makes. But if `store` was used, and the name is that of its
+        A recipe is all settings of an engine. It is the named one (conv if no name was given) with
+        the settings that were given. But if `store` was used before, and the name is that of its
         reducer or was not given, it is the store's recipe with the settings that were given: the
-        others stay as stored. A store that is missing or cannot be opened is taken for new.
-        Raises SettingError like `make_contender`, and if the stored recipe cannot be read.
+        others stay as stored. A store that is missing or cannot be opened is taken for new. Raises
+        SettingError if a recipe or its reducer is not found or cannot be read, also the stored
+        recipe, and if a setting is out of range.
         """
         from ..recipe import Recipe
         from ..store.opening import open_store
@@ -326,8 +330,10 @@ class RecipeChoice:
     def make_contender(self) -> Contender:
         """Return the `Contender` that a replay runs: a recipe or a baseline, with its name.
 
-        It is what `Contender.load` returns for the name (conv if none was given), with the settings
-        that were given. Its name is shortened, as `short_name` does.
+        A recipe is all settings of an engine, and a baseline a published method, for comparison.
+        The result is what `Contender.load` returns for the name (conv if none was given), with the
+        settings that were given. Its name is shortened: folder/often.toml becomes often, and
+        module:Class Class.
 
         Raises
         ------
@@ -476,10 +482,11 @@ class DataChoice:
     def describe(self, *, propose: bool = False) -> Description | None:
         """Return the description with the stated keys; None for a source that needs none.
 
-        A bundled set, the file of a store, and a file of traces and labels that dengine reads by
-        itself (such as an .npz file with X and y) need none, unless a key is stated, or a
-        description is given, or one is saved beside the file. A progress bar is shown while the
-        description is read or proposed. Nothing is saved.
+        A description says how recordings are read. A bundled set (data that come with dengine), the
+        file of a store, and a file of traces and labels that dengine reads by itself (such as an
+        .npz file with X and y) need none, unless a key is stated, or a description is given, or one
+        is saved beside the file. A progress bar is shown while the description is read or proposed.
+        Nothing is saved.
 
         Parameters
         ----------
@@ -494,7 +501,8 @@ class DataChoice:
             has the wrong type. If the source does not exist or is damaged; but if a description is
             given, the source is not looked at.
         SettingError
-            If none is given or saved, and a stated `windows.trigger` is malformed.
+            If none is given or saved, and a stated `windows.trigger` (where a part begins) is
+            malformed.
         """
         from ..datasets.loading import description_of, own_reader
 
@@ -507,21 +515,21 @@ class DataChoice:
         """Load the data set, with a progress bar, and return it.
 
         It has only the channels and samples that the options `--channels` and `--samples` ask for.
-        `Dataset.notes`, and the first three recordings that were left out, are printed to stderr,
-        but not with `--json`. `description` is the description to read by; None takes the one that
-        `describe` returns. A damaged trace of a store is left out, and the store gets an event on
-        it.
+        Its `notes`, and the first three recordings that were left out, are printed to stderr, but
+        not with `--json`. `description` says how recordings are read; None takes the one that
+        `describe` returns. A damaged trace of a store is left out, and an event in the store's log
+        says so.
 
         Raises
         ------
         DataError
             If the data set cannot be read, a channel does not exist, or the traces are shorter than
-            `--samples`, or longer although they were resampled. Also if a description is needed and
-            none is saved, if it has a `?`, or if a stated key is unknown or its value has the wrong
-            type.
+            `--samples`, or longer and resampled, so that they cannot be cut. Also if a description
+            is needed and none is saved, if a value in it is `?` (not known yet), or if a stated key
+            is unknown or its value has the wrong type.
         SettingError
-            If `windows.trigger` of the description is malformed, or `--channels` is given for a
-            data set of which `Dataset.spec` cannot be made.
+            If `windows.trigger` of the description (where a part begins) is malformed, or
+            `--channels` is given for a data set of which `Dataset.spec` cannot be made.
         StoreError
             If the data set is a store that cannot be opened or read.
         Exception
@@ -549,10 +557,10 @@ class DataChoice:
 def fault_lines(data: Dataset, most: int) -> list[str]:
     """Return lines that list the faults of a data set, with the reasons.
 
-    A fault is a recording or file that could not be read by the description, or a recording that
-    repeats another one. The first line counts the faults and all recordings, those without a label
-    included. At most `most` faults are named, in their order, and a last line counts the other
-    faults. Without faults the list is empty.
+    A fault is a recording or file that could not be read as its description says, or a recording
+    that repeats another one. The first line counts the faults and all recordings, those without a
+    label included. At most `most` faults are named, in their order, and a last line counts the
+    other faults. Without faults the list is empty.
     """
     n_faults = len(data.faults)
     if not n_faults:
@@ -697,12 +705,14 @@ def data_options(
 def recorder_settings(options: Options) -> tuple[Values, TraceSpec]:
     """Return the settings of an `RtdeRecorder`, by its argument names, and its `TraceSpec`.
 
-    They come from the values of `--samples`, `--channels`, `--rate-hz`, `--unit` and `--fit` in
-    `options`, by the names in `TRACE`, as far as they were given; other options are ignored. The
-    settings are samples, rate_hz and channels, and those that were not given are left out. The
-    `TraceSpec` has the recorder's defaults for them (see `spec_of_recording`), and also the unit
-    and the fit (what is done with traces of another length). Without `--unit` the unit of a force
-    is N, and any other is unknown. Raises SettingError for values that no trace can have.
+    An `RtdeRecorder` records traces of a Universal Robots controller; a `TraceSpec` says what
+    shape, rate and unit traces have. Both come from the values of `--samples`, `--channels`,
+    `--rate-hz`, `--unit` and `--fit` in `options`, by the names in `TRACE`, as far as they were
+    given; other options are ignored. The settings are samples, rate_hz and channels, and those that
+    were not given are left out. The `TraceSpec` has the recorder's defaults for them (see
+    `spec_of_recording`), and also the unit and the fit (what is done with traces of another
+    length). Without `--unit` the unit of a force is N, and any other is unknown. Raises
+    SettingError for values that no trace can have.
     """
     from ..cells.ur.recorder import spec_of_recording
 
@@ -713,11 +723,11 @@ def recorder_settings(options: Options) -> tuple[Values, TraceSpec]:
 
 
 def trace_spec_from(options: Options) -> TraceSpec | None:
-    """Return the `TraceSpec` that the options in `TRACE` state of live traces, those of a robot
-    cell.
+    """Return the `TraceSpec` of live traces that the options in `TRACE` state, None without them.
 
-    If `--channels` is one whole number, this is the number of channels; otherwise it has their
-    names. Without it there is one channel.
+    It says what shape, rate and unit the traces have that a robot cell records. If `--channels` is
+    one whole number, this is the number of channels; otherwise it has their names. Without it there
+    is one channel.
 
     Parameters
     ----------

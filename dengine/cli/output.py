@@ -201,7 +201,7 @@ def table_of_rows(
 ) -> "Table":
     """Return a rich Table whose first column is bold; passwords of database URLs are masked.
 
-    A cell that is too wide is folded; the first column only if it has a cell of more than 40
+    A cell that is too wide is wrapped; in the first column only if it has a cell of more than 40
     characters (`LONGEST_NAME`). Print it with `markup=False`: cells and titles of columns are not
     escaped.
 
@@ -278,11 +278,11 @@ def format_value(name: str, value: Any) -> str:
         A number, a text, a dataclass, or a mapping, list or tuple of these. None, NaN and "" give
         "-", a bool "yes" or "no". A dataclass gives its own `str`, or else its fields with their
         headings, of which those that are None or empty are left out. Of a mapping only the items
-        that are not 0 are shown, each after its key, which is its name; if there are none, the text
-        is "none". Items are joined by commas; those of `prices` have titles (`TUPLE_TITLES`); an
-        empty list or tuple gives "". A number whose name has no known ending has 4 significant
-        digits, or is whole if it is a whole number, with commas between thousands. Passwords of
-        database URLs in a text are masked.
+        that are not 0 are shown, each after its key, by which it is formatted; if there are none,
+        the text is "none". Items are joined by commas; each of the three `prices` stands after its
+        title (`TUPLE_TITLES`); an empty list or tuple gives "". A number whose name has no known
+        ending has 4 significant digits, or is whole if it is a whole number, with commas between
+        thousands. Passwords of database URLs in a text are masked.
 
     Raises
     ------

@@ -81,12 +81,13 @@ class Stream:
 def _play(
     dataset: Dataset, tasks: Sequence[Task], stream: Stream
 ) -> tuple[list[PlayedReplay], BaseException | None]:
-    """Play tasks, each a replay to be played, with a progress bar; return what was finished.
+    """Play replays with a progress bar; return the finished ones, and what ended the work early.
 
-    That is the finished replays in the order of their tasks, and the error or Ctrl-C that ended the
-    work early (None if nothing did), which is not raised: the caller must pass it to `_end`. Of
-    `stream` the number of processes, the folder of kept replays and, only for the length of the
-    bar, the cycles are used.
+    A replay plays recorded parts through a new engine; each of `tasks` is a replay to be played.
+    The finished replays are in the order of their tasks. The error or Ctrl-C that ended the work
+    early (None if nothing did) is not raised: the caller must pass it to `_end`. Of `stream` these
+    are used: the number of processes, the folder of replays that were finished earlier and are not
+    played again, and, only for the length of the bar, the number of parts of a replay.
     """
     from ..experiments.grid import iterate_replays
 
@@ -108,11 +109,11 @@ def _play(
 
 
 def _end(error: BaseException | None, text: str, is_shown: bool = True) -> None:
-    """End the subcommand if an error or Ctrl-C interrupted its replays; do nothing if `error` is
-    None.
+    """End the subcommand if an error or Ctrl-C interrupted its replays; do nothing for None.
 
-    `text` says which replays are shown. After Ctrl-C it is printed to stderr, and the exit code is
-    130. Any other error is raised; before, `text` is printed to stderr if `is_shown`.
+    `error` is what interrupted them, and `text` says which replays are shown. After Ctrl-C `text`
+    is printed to stderr, and the exit code is 130. Any other error is raised; before, `text` is
+    printed to stderr if `is_shown`.
     """
     if isinstance(error, KeyboardInterrupt):
         exit_interrupted(f"Interrupted: {text}")
@@ -128,9 +129,10 @@ _SHUFFLES = "Number of shuffled replays of each recipe."
 def stream_options(repeats: int, least: int, n_jobs: int, text: str) -> Callable[[Any], Any]:
     """Return a decorator that adds the options that say how recorded streams are played.
 
-    These are `--repeats`, `--seed`, `--cycles`, `--in-order`, `--n-jobs` and `--keep`. The
-    subcommand gets them as one `Stream`, its argument `stream`. `--repeats` together with
-    `--in-order` is a usage error.
+    A stream is the parts of a data set in the order in which an engine gets them. The options are
+    `--repeats`, `--seed`, `--cycles`, `--in-order`, `--n-jobs` and `--keep`. The subcommand gets
+    them as one `Stream`, its argument `stream`. `--repeats` together with `--in-order` is a usage
+    error.
 
     Parameters
     ----------
@@ -251,13 +253,15 @@ def compare(
 ) -> None:
     """Replay the same streams through several methods.
 
-    Methods are reducers and baselines, each with a name of its own. They are played under one
-    policy or a grid of policies: give a setting either as one value (--alpha) or as a list to try
-    (--alphas); both are a usage error. --paper gives the lists of the paper, each unless you give
-    your own; beside it, one value of alpha, the lower bound or the interval is a usage error. The
-    output is that of `dengine replay`, in one table with a row for each method and policy.
-    umap-learn takes much longer than the others. Ctrl-C (exit code 130), or an error in a replay
-    (1), ends it and shows the replays that were finished.
+    Methods are reducers, and baselines (published methods, for comparison), each with a name of its
+    own. A stream is a shuffle of the recordings. Each method plays it under one policy (the
+    settings of its decisions) or a grid of policies: give a setting either as one value (--alpha)
+    or as a list to try (--alphas); both are a usage error. --paper gives the lists of the paper,
+    each unless you give your own; beside it, one value of alpha, the lower bound or the interval is
+    a usage error. One table, with a row for each method and policy, shows what was decided and how
+    much of it was wrong, like that of `dengine replay`. umap-learn takes much longer than the
+    others. Ctrl-C (exit code 130), or an error in a replay (1), ends it and shows the replays that
+    were finished.
     """
     short_names = [short_name(name) for name in names]
     if len(set(short_names)) < len(short_names):
@@ -299,25 +303,26 @@ def _replay_and_print(
     check_seconds: float,
     out: Out | None,
 ) -> None:
-    """Play replays with all combinations of the values in `grid`, print tables or one JSON
-    document, and write the files of `out`.
+    """Play replays with all combinations of the values in `grid`; print and write the results.
 
-    After Ctrl-C or an error the finished replays are shown, if there are some, and a line on stderr
-    says how many; after an error without finished replays there is no such line. Then the process
-    ends with exit code 130, or the error is raised. Errors of the data set, and settings out of
-    range, are raised before anything is played. A file that cannot be written is an OutputError,
-    raised after the result was printed, and then in place of the error or exit code 130.
+    A replay plays recorded parts through a new engine. Tables are printed, or one JSON document
+    with `--json`, and the files of `out` are written. After Ctrl-C or an error the finished replays
+    are shown, if there are some, and a line on stderr says how many; after an error without
+    finished replays there is no such line. Then the process ends with exit code 130, or the error
+    is raised. Errors of the data set, and settings out of range, are raised before anything is
+    played. A file that cannot be written is an OutputError, raised after the result was printed,
+    and then in place of the error or exit code 130.
 
     Parameters
     ----------
     contenders : sequence of Contender
-        Who plays: recipes and baselines.
+        Who plays: recipes (all settings of an engine) and baselines (published methods).
     grid : mapping
         Values to try, by the argument of `grid_tasks` that takes them, such as "alphas".
     source : DataChoice
         The data set that the user asked for.
     stream : Stream
-        How it is played: seeds, cycles, order.
+        How it is played: seeds, number of parts (cycles), order.
     check_seconds : float
         Duration of a verification, from which the saved time is computed.
     out : Out or None
@@ -378,9 +383,11 @@ def _group_replays(
 def _title(data: str, replays: Sequence[Replay], names: Iterable[str], in_order: bool) -> str:
     """Return the title of tables and pictures.
 
-    It names the recipes and baselines (`names`), the data set, the order of the parts (recorded if
-    `in_order`, else shuffled), the number of seeds, and the number of cycles of a replay. The
-    bundled data set is called "simulated insertions". There must be at least one replay.
+    It has the names of what was played (`names`: recipes, the settings of an engine, and baselines,
+    published methods), the data set, the order of the parts (recorded if `in_order`, else
+    shuffled), the number of seeds, and the number of parts that a replay played. The data set
+    "insertion", which comes with dengine, is called "simulated insertions". There must be at least
+    one replay.
     """
     order = "in recorded order" if in_order else "shuffled"
     dataset = "simulated insertions" if data == "insertion" else data
@@ -393,10 +400,11 @@ def _replay_files(
 ) -> Iterator[tuple[str, Any]]:
     """Yield the name and the content of each file that `--out` writes.
 
-    These are replays.csv, a table with a row for each replay (`frame`); curves.png, with the errors
-    and the share of certain decisions over the cycles; and for each recipe a map of the embedding
-    in its first replay, map_NAME.png. There is no map if no trace was embedded, such as in a
-    baseline's replay. `title` is the title of the curves.
+    These are replays.csv, a table with a row for each replay (`frame`); curves.png, with the shares
+    of errors and of decisions without a check over the parts played; and for each recipe (the
+    settings of an engine) a picture of the embedding in its first replay, map_NAME.png. There is
+    none if no trace was embedded, such as in a replay of a baseline, a published method. `title` is
+    the title of the curves.
     """
     import numpy as np
 
@@ -414,8 +422,9 @@ def _replay_files(
 def _row_name(replay: Replay, frame: pd.DataFrame) -> str:
     """Return a label for a replay in figures, like "conv, alpha 0.1, LB 90 %".
 
-    It has the name of the recipe or baseline, and those of guarantee, stops, interval, alpha and
-    lower bound (LB) that vary in `frame`, the table of all replays.
+    It has the name of what was played (a recipe, the settings of an engine, or a baseline, a
+    published method), and those settings of the policy that vary in `frame`, the table of all
+    replays: guarantee, stops, interval, alpha and lower bound (LB).
     """
     policy = replay.recipe.policy
     settings = {
@@ -500,19 +509,27 @@ def costs(
 ) -> None:
     """Find out, by three prices, which policy pays.
 
-    Shows what a part of your recordings costs under the best policies, and what it costs if
-    everything is verified. Says how certain these costs are, and how to set the policy. If no
-    policy pays or may pay, the choice is to verify everything, and the output names no policy to
-    set. The policies that are tried have the guarantee local or pooled, each with values of LB, the
-    lower bound, around break-even, where accepting costs as much as verifying (or with those of
-    --lower-bounds), or the guarantee cost; these replace --guarantee and --prices. A baseline is
-    tried under local alone, and a rule of your own in place of all three. --alpha and --lower-bound
-    are usage errors: give --alphas and --lower-bounds. All costs are in one unit, such as seconds
-    of production or money. --out writes costs.csv and costs.png. Ctrl-C (exit code 130), or an
-    error in a replay (1), ends it and shows what was finished, if at least two shuffles are
-    finished by every policy that is left. The exit code is 1 if a check costs as much as a bad
-    accepted part or more, if a false reject costs nothing, or if the recordings have one label only
-    or are too few.
+    A policy is how the engine decides: a guarantee (its rule) with settings like alpha. The prices
+    are those of a check, of a bad part that is accepted (--escape) and of a good part that is
+    rejected (--false-reject), all in one unit, such as seconds of production or money. Policies are
+    replayed on shuffles of your recordings. The output shows what a part costs under the best
+    policies, and what it costs if everything is verified. It says how certain these costs are, and
+    how to set the policy. A policy pays if the whole interval of its cost is below the cost of
+    verifying everything, and may pay if that is open. If no policy pays or may pay, the choice is
+    to verify everything, and the output names no policy to set.
+
+    The policies that are tried have the guarantee local (LB, the lower bound of the success
+    probability, is for each accepted part) or pooled (LB is for all parts together that reach its
+    threshold), each with values of LB around break-even, where accepting costs as much as verifying
+    (or with those of --lower-bounds), or the guarantee cost, which decides by the prices; these
+    replace --guarantee and --prices. A rule of your own is tried in place of all three. With
+    --stops some, and without an audit rate, pooled and cost check 5 % of the parts that they could
+    decide (audits). --alpha and --lower-bound are usage errors: give --alphas and --lower-bounds.
+
+    --out writes costs.csv and costs.png. Ctrl-C (exit code 130), or an error in a replay (1), ends
+    it and shows what was finished, if at least two shuffles are finished by every policy that is
+    left. The exit code is 1 if a check costs as much as a bad accepted part or more, if a false
+    reject costs nothing, or if the recordings have one label only or are too few.
     """
     _refuse_value_beside_list(choice.settings, ("alphas", "lower_bounds"))
     from ..experiments.costs import find_policy, settings_of
@@ -587,12 +604,12 @@ def costs(
 
 
 def _curve_lines(curve: CostCurve, dataset: Dataset) -> list[str]:
-    """Return the sentences below the table of a cost curve: what a part costs under each policy.
+    """Return the sentences below the table of what a part costs under each policy.
 
-    They say which policy was chosen, and how the choice depends on the prices. If there are any,
-    they also say how many recordings of the data set equal an earlier one (by `content_hash`),
-    which policies were left behind because they were dearer in the first shuffles, and which were
-    not tried.
+    They say which policy was chosen, and how the choice depends on the three prices (of a check, a
+    bad accepted part and a good rejected part). If there are any, they also say how many recordings
+    of the data set equal an earlier one (by a hash of their samples), which policies were left
+    behind because they were dearer in the first shuffles, and which were not tried.
     """
     from ..experiments.costs import policy_name
     from ..experiments.survey import survey_dataset
@@ -625,11 +642,11 @@ def _as_flags(settings: Options) -> str:
 def _cost_cells(row: PolicyCost, is_chosen: bool) -> tuple[str, ...]:
     """Return the cells of a policy's row in the table of costs, under the titles in `COLUMNS`.
 
-    They are its rule (like "alpha 0.1" if its guarantee is local, else the name of the guarantee;
-    "> " stands before it if the policy is chosen), its LB in percent (`lower_bound` of the
-    policy; "-" if its guarantee is cost), cost with its interval in a second line, late cost (over
-    the last third of each shuffle), share of verified parts, and wrong accepts and rejects
-    with the intervals of their shares.
+    They are its rule ("> " stands before it if the policy is chosen), its LB in percent
+    (`lower_bound` of the policy; "-" if its guarantee is cost), cost with its interval in a second
+    line, late cost (over the last third of each shuffle), share of verified parts, and wrong
+    accepts and rejects with the intervals of their shares. The rule is like "alpha 0.1" if the
+    guarantee is local, else the name of the guarantee, which is the rule that decides.
     """
     policy = row.policy
     rule = f"alpha {policy.alpha:g}" if policy.guarantee == "local" else policy.guarantee
@@ -645,11 +662,10 @@ def _cost_cells(row: PolicyCost, is_chosen: bool) -> tuple[str, ...]:
 
 
 def _error_cell(error: ErrorRate) -> str:
-    """Return how many decisions were wrong, like "3 of 120", and in a second line the interval of
-    their share in percent, like "0.5–7.1 %".
+    """Return how many decisions were wrong and the interval of their share, in two lines of text.
 
-    The ends of the interval have at most three significant digits. The text is "-" if there was no
-    decision.
+    The lines are like "3 of 120" and "0.5–7.1 %". The ends of the interval have at most three
+    significant digits. The text is "-" if there was no decision.
     """
     if not error.decided:
         return "-"

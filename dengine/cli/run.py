@@ -87,18 +87,21 @@ def run(
 ) -> None:
     """Drive a robot cell: verify, learn, and verify less.
 
-    With a store that exists the engine continues where it was. If you give an option of the recipe,
-    the whole recipe (conv, if you name no other) must be the store's; otherwise the store's recipe
-    is used. The simulated cell then makes new parts, and a recording continues after its last part
-    that was labelled or accepted: no part is learned from twice. It is refused if it has fewer
-    parts left than --cycles. A robot runs dengine/cells/ur/ur_cell.script, or a program with the
-    same handshake; --trigger and --samples say what is recorded of it. If too many decisions are
-    wrong, or too many traces are unlike all known ones, the engine enters safe mode: parts are
-    verified until new outcomes allow decisions again. --shadow stays in force in the store, until
-    `dengine policy STORE --shadow off`. At the end a table shows what was decided, what was wrong
-    and what was saved. Ctrl-C or SIGTERM ends the run after the current cycle, and a second Ctrl-C
-    at once; what was done is shown, and the exit code is 130. A second SIGTERM ends the process,
-    and nothing is shown. If the cell fails, what was done is shown, too, and the exit code is 1.
+    With a store that was used the engine continues where it was, with the store's recipe (all
+    settings of the engine); an option of the recipe that states another value is refused. The
+    simulated cell then makes new parts, and a recording continues after its last part that was
+    labelled or accepted: no part is learned from twice. A recording that has fewer parts left than
+    --cycles is refused. A robot runs dengine/cells/ur/ur_cell.script, or a program with the same
+    handshake; --trigger says when its traces begin, and --samples how long they are.
+
+    If too many decisions are wrong, or too many traces are unlike all known ones, the engine enters
+    safe mode: parts are verified until new outcomes allow decisions again. There is no safe mode
+    under --guarantee local with --stops some, the default. --shadow (verify every part) stays in
+    force in the store, until `dengine policy STORE --shadow off`. At the end a table shows what was
+    decided, what was wrong and what was saved. Ctrl-C or SIGTERM ends the run after the current
+    cycle, and a second Ctrl-C at once; what was done is shown, and the exit code is 130. A second
+    SIGTERM ends the process, and nothing is shown. If the cell fails, what was done is shown, too,
+    and the exit code is 1.
     """
     if kind == "simulated":
         options.require_modules("the simulated cell", "sim", "mujoco")
@@ -156,15 +159,18 @@ def run(
 def _drive(
     engine: DataEngine, cell: Cell, cycles: int, name: str
 ) -> tuple[Replay, list[Record], CellError | None]:
-    """Let the engine drive the robot cell with a progress bar named `name`; return the finished
-    cycles, the changes of safe mode, and what ended the run if the cell failed.
+    """Let the engine drive the robot cell; return its cycles, changes of safe mode, and an error.
 
-    A change has the `cycle` after which safe mode began or ended, and its `reason`, "" if it ended.
+    In safe mode, after an alarm, every part is verified until outcomes allow decisions again.
+    Returned are the record of the finished cycles (one part in each), the changes of safe mode, and
+    the CellError that ended the run if the cell failed, which is not raised, else None; other
+    errors are raised. A change has the `cycle` after which safe mode began or ended, and its
+    `reason`, "" if it ended.
 
     The run ends after `cycles` parts, or after the current one at Ctrl-C or SIGTERM; a second
-    Ctrl-C ends the run at once, without its last cycle, and a second SIGTERM ends the process. If
-    the cell fails, its CellError is returned and not raised; other errors are raised. When safe
-    mode begins or ends, a line is printed to stderr, unless `--json`.
+    Ctrl-C ends the run at once, without its last cycle, and a second SIGTERM ends the process. A
+    progress bar named `name` is shown. When safe mode begins or ends, a line is printed to stderr,
+    unless `--json`.
     """
     from ..experiments.replay import ObservedCycle, observe_cycles, to_replay
 
@@ -194,7 +200,8 @@ def _drive(
 def _safe_mode_line(change: Record) -> str:
     """Return a sentence: after which cycle safe mode began, and why, or that it ended.
 
-    `change` has the number of the cycle, `cycle`, and the `reason`, "" if safe mode ended.
+    In safe mode, after an alarm, every part is verified. `change` has the number of the cycle,
+    `cycle`, and the `reason`, "" if safe mode ended.
     """
     event = "safe mode ended"
     if change["reason"]:
@@ -205,14 +212,14 @@ def _safe_mode_line(change: Record) -> str:
 def _simulated_cell(scenario: str, cycles: int, source: DataChoice, **others: Any) -> CellToDrive:
     """Return the `TraceSpec` of the simulated cell, and a function that makes the robot cell.
 
-    The `TraceSpec` is the simulation's own, or what the options of `source` state; rate, unit and
-    names of channels that these leave out are then the simulation's, if the shape is the same. The
-    function takes the engine, and returns the cell and its name. The cell's seed depends on the
-    engine's seed, on the number of decisions in the store, and in a product (cells that share
-    labels) also on the cell, so that no part comes twice. `scenario` says what changes in the
-    course of the `cycles`; for an unknown one SettingError is raised when the cell is made.
-    `others` are settings of other kinds of cell, and are ignored. Raises what `trace_spec_from`
-    raises.
+    A `TraceSpec` says what shape, rate and unit traces have. It is the simulation's own, or what
+    the options of `source` state; rate, unit and names of channels that these leave out are then
+    the simulation's, if the shape is the same. The function takes the engine, and returns the cell
+    and its name. The cell's seed depends on the engine's seed, on the number of decisions in the
+    store, and in a product (cells that share labels) also on the cell, so that no part comes twice.
+    `scenario` says what changes in the course of the `cycles`; for an unknown one SettingError is
+    raised when the cell is made. `others` are settings of other kinds of cell, and are ignored.
+    Raises what `trace_spec_from` raises.
     """
     from ..cells.simulation.cell import SimulatedCell
 
@@ -237,12 +244,14 @@ def _simulated_cell(scenario: str, cycles: int, source: DataChoice, **others: An
 def _replay_cell(source: DataChoice, cycles: int, **others: Any) -> CellToDrive:
     """Return the `TraceSpec` of a recording, and a function that makes a robot cell which plays it.
 
-    The recording is the data set of `source`, and is loaded at once. The cell begins after the last
-    part that was played before. A part was played before if its trace equals one that has a label
-    of this cell in the store (but no forgotten label, and no trace with a fault), or that of this
-    cell's newest accepted part without a report. Making the cell raises SettingError if fewer parts
-    than `cycles` are left, and StoreError if the store cannot be read or the trace of that accepted
-    part is damaged. `others` are ignored. Raises the errors of `DataChoice.load`.
+    A `TraceSpec` says what shape, rate and unit traces have. The recording is the data set of
+    `source`, and is loaded at once. The function takes the engine, and returns the cell and its
+    name. The cell begins after the last part that was played before. A part was played before if
+    its trace equals one that has a label of this cell in the store (but no label that a person
+    withdrew, and no trace with a fault), or that of this cell's newest accepted part without a
+    report. Making the cell raises SettingError if fewer parts than `cycles` are left, and
+    StoreError if the store cannot be read or the trace of that accepted part is damaged. `others`
+    are ignored. Raises the errors of `DataChoice.load`.
     """
     import numpy as np
 
@@ -281,10 +290,10 @@ def _replay_cell(source: DataChoice, cycles: int, **others: Any) -> CellToDrive:
 def _robot_cell(source: DataChoice, host: str | None, **others: Any) -> CellToDrive:
     """Return the `TraceSpec` of a robot, and a function that connects to it and makes its cell.
 
-    The robot is a Universal Robots controller at `host`, HOST or HOST:PORT. The options of `source`
-    say what is recorded, and when; `others` are settings of other kinds of robot cell, and are
-    ignored. Nothing is connected before the function is called. The cell's `close` ends the
-    connection.
+    A `TraceSpec` says what shape, rate and unit traces have. The robot is a Universal Robots
+    controller at `host`, HOST or HOST:PORT. The options of `source` say what is recorded, and when;
+    `others` are settings of other kinds of robot cell, and are ignored. Nothing is connected before
+    the function is called. The cell's `close` ends the connection.
 
     Raises
     ------
@@ -351,13 +360,14 @@ COLUMNS = {  # title -> count of a stretch
 def _print_run(replay: Replay, record: Record, cell: Any, out: Out | None) -> None:
     """Print the result of a run: a table of stretches, the cell's own report, and sentences.
 
-    A stretch is a number of consecutive cycles. The cell's own report is shown if the robot cell
-    has a method `report`. The sentences say how much time was saved (the checks left out, less 120
-    s for each line stop and 47.5 s for each rejected good part), how the retrains went, when safe
-    mode began and ended, and what share of the accepted parts was bad at most (the certificate).
-    The counts are added to `record`, which has the rest, in place, and `--json` prints it in place
-    of all that. run.csv and run.png are written to `out`, if it is given; OutputError, if that
-    fails, is raised after the printing.
+    A stretch is a number of consecutive cycles, each with one part. The cell's own report is shown
+    if the robot cell has a method `report`. The sentences say how much time was saved (the checks
+    left out, less 120 s for each accepted part that stopped the line and 47.5 s for each rejected
+    good part), how the retrains went, when safe mode (every part is verified) began and ended, and
+    what share of the accepted parts was bad at most (the certificate). The counts are added to
+    `record`, which has the rest, in place, and `--json` prints it in place of all that. run.csv and
+    run.png are written to `out`, if it is given; OutputError, if that fails, is raised after the
+    printing.
     """
     from ..experiments.figures import curves
     from ..experiments.metrics import Costs
@@ -407,9 +417,10 @@ def _print_run(replay: Replay, record: Record, cell: Any, out: Out | None) -> No
 def _stretch_cells(stretch: Mapping[str, Any], total: Mapping[str, Any]) -> dict[str, str]:
     """Return a table row, title -> cell, for the counts of a stretch of cycles.
 
-    `stretch` and `total`, the counts of the whole run, are as `Replay.stretch` returns them. The
-    cells are its first and last cycle, the share of verified parts in whole percent, and the counts
-    in `COLUMNS`. Parts outside the force limits have no column if there were none in the whole run.
+    A stretch is a number of consecutive cycles. `stretch` and `total`, the counts of the whole run,
+    are as `Replay.stretch` returns them. The cells are its first and last cycle, the share of
+    verified parts in whole percent, and the counts in `COLUMNS`. Parts outside the force limits
+    that an operator set have no column if there were none in the whole run.
     """
     cells = {
         "cycles": f"{stretch['first_cycle']} to {stretch['last_cycle']}",

@@ -111,18 +111,22 @@ def serve(
     seed: int | None,
     **settings: Any,
 ) -> None:
-    """Answer robots, controllers and people.
+    """Answer robots, controllers and people over the network.
 
-    Continues with its store, which must have the settings that are given, or starts a new one, and
-    retrains in a separate process. It runs until SIGTERM or Ctrl-C. Then waiting requests are
-    answered, within 5 s, everything known is written, and the exit code is 0; a second Ctrl-C does
-    not wait for the requests. --shadow stays in force in the store, until `dengine policy STORE
-    --shadow off`. --store, --demo or both must be given. --demo plays recorded parts like a robot,
-    with a deadline of 5 s or more; if neither --reducer nor a setting of the policy or novelty is
-    given, it decides under conv with alpha 0.1, LB 90 % and 5 % of audits. It keeps the parts in
-    --store, and refuses a file that exists; without --store it forgets them at the end. Without
-    --token-file, programs on the same machine need no token. Other machines reach it only with
-    --host, which needs --token-file, and should have --cert and --key. --samples, --rate-hz,
+    An engine decides on parts for them over HTTP, XML-RPC and OPC UA, and a web page shows what it
+    does. It continues with its store, which must have the settings that are given, or starts a new
+    one, and retrains in a separate process. It runs until SIGTERM or Ctrl-C. Then waiting requests
+    are answered, within 5 s, everything known is written, and the exit code is 0; a second Ctrl-C
+    does not wait for the requests. --shadow (verify every part) stays in force in the store, until
+    `dengine policy STORE --shadow off`. --store, --demo or both must be given.
+
+    --demo plays recorded parts like a robot, with a deadline of 5 s or more; if neither --reducer
+    nor a setting of the policy or novelty is given, it decides with the reducer conv, alpha 0.1, a
+    lower bound of 90 % and an audit rate of 5 %. It keeps the parts in --store, and refuses a file
+    that exists; without --store it forgets them at the end.
+
+    Without --token-file, programs on the same machine need no token. Other machines reach it only
+    with --host, which needs --token-file, and should have --cert and --key. --samples, --rate-hz,
     --unit, --channels and --fit say what a trace looks like. With --demo only --samples counts.
     With --robot a trace has 1000 samples at 500 Hz by default. Otherwise the four other options
     need --samples, and without all five a new store takes the shape of its first trace, and rate
@@ -191,12 +195,13 @@ def _open_engine(
 ) -> "DataEngine":
     """Open the engine that the server drives, or create it with its store, and return it.
 
-    The engine trains in `executor`, and logs when safe mode begins or ends. If `shadow` is True,
-    shadow mode, which verifies every part, is turned on, and stays on in the store. `seed` is the
-    seed of a new store's engine, None for that of another robot cell of its product, or 0; if it is
-    given, a used store must have the same seed. `settings` are further arguments of
-    `DataEngine.open_or_create`. Raises what that method raises, and what `DataEngine.set_shadow`
-    raises; in the second case the engine stays open.
+    The engine trains in `executor`, and logs when safe mode, in which every part is verified after
+    an alarm, begins or ends. If `shadow` is True, shadow mode, which verifies every part, is turned
+    on, and stays on in the store. `seed` is the seed of a new store's engine; None stands for that
+    of another robot cell of its product (cells that share labels), or 0; if it is given, a used
+    store must have the same seed. `settings` are further arguments of `DataEngine.open_or_create`.
+    Raises what that method raises, and what `DataEngine.set_shadow` raises; in the second case the
+    engine stays open.
     """
     from ..engine.engine import DataEngine
     from ..serve.server import log_safe_mode

@@ -54,13 +54,15 @@ ONLY_WHILE_RUNNING = ("retraining", "store_lag")
 def status(store: str, last: int, check_seconds: float) -> None:
     """Show how an engine is doing, and what its store holds.
 
-    STORE is the file or URL of the engine's store, as given to `dengine train` or `dengine run`,
-    and must exist. An engine may run on it meanwhile. If it holds several robot cells and none is
-    named, they are only listed; cells of one product share labels and versions. A damaged label or
-    version that is read is recorded as an event. The interval of bad accepted parts is valid if you
-    look once; the certificate, which bounds their share, is valid however often you look. If the
-    model was certain of parts that were verified, like in shadow mode, a line says how much time it
-    would have saved, at `--check-seconds` for each check.
+    STORE is the file or URL of the engine's store (its database), as given to `dengine train` or
+    `dengine run`, and must exist. An engine may run on it meanwhile. If it holds several robot
+    cells and none is named, they are only listed; cells of one product (the kind of part that they
+    make) share labels and versions of the model. A damaged label or version that is read is
+    recorded as an event in the store's log. The interval of bad accepted parts is valid if you look
+    once; the certificate, an upper bound on their share, is valid however often you look. If the
+    model would have accepted or rejected parts that were verified, like in shadow mode (every part
+    is verified), a line says how much time that would have saved, at `--check-seconds` for each
+    check.
     """
     from ..history.status import status as read_status
     from ..representation import to_jsonable
@@ -94,10 +96,10 @@ def status(store: str, last: int, check_seconds: float) -> None:
 
 
 def _overview_table(store: str, report: "Status") -> Any:
-    """Return a rich Table of the counts and shares in a store's status, false accepts first.
+    """Return a rich Table of the counts and shares in a store's status, accepted bad parts first.
 
-    It has a row for each field, a column for the newest decisions, and one for all decisions since
-    the store was made. `store`, its address, stands in the title.
+    It has a row for each field of a `Span`, with a column for the newest decisions, and one for all
+    decisions since the store was made. `store`, its address, stands in the title.
     """
     spans = (report.newest, report.ever)
     names = [field.name for field in fields(report.ever)]
@@ -115,12 +117,14 @@ def _present_rows(report: "Status") -> list[tuple[str, str]]:
     """Return rows of a table, (title, text), on the present state of an engine, an alarm first.
 
     They are the robot cell; the fields of the status that are not empty, except those in
-    `SHOWN_ELSEWHERE` and those that only a running engine knows; the recipe; the `TraceSpec`; the
-    certificate on accepted and on rejected parts; the last and the slowest retrain; and the newest
-    events, with a row for each, the newest first. An alarm, or a retrain, has a row only if there
-    is one. The recipe is left out if the model was handed in by the user, because the recipe has no
-    effect on it. Without audits, the counts with the name "audit" are called "certain but checked":
-    they come from shadow mode.
+    `SHOWN_ELSEWHERE` and those that only a running engine knows; the recipe (all settings of the
+    engine); the `TraceSpec` (shape, rate and unit of traces); two sentences of the certificate,
+    with the largest shares of wrong decisions on accepted and on rejected parts; the last and the
+    slowest retrain; and the newest events, with a row for each, the newest first. An alarm, or a
+    retrain, has a row only if there is one. The recipe is left out if the model was handed in by
+    the user, because the recipe has no effect on it. If the policy has no audits (checks of parts
+    of which the model is certain), the counts with the name "audit" are called "certain but
+    checked": they come from shadow mode, in which every part is verified.
     """
     rows = []
     if report.alarm:
@@ -167,8 +171,9 @@ def _span_cell(name: str, span: "Span") -> str:
     """Return the text of a field of a `Span`: a time, a number, or a share of wrong decisions.
 
     A `Span` has the counts over the newest decisions, or over all, and `name` names its field. The
-    text on a share also says whether it keeps to the tolerance, as in `_error_cell`; it is "none
-    was accepted" for the share of bad accepted parts if no part was accepted.
+    text on a share has its interval, and says whether it keeps to the tolerance, the share that the
+    policy allows (see `_error_cell`); it is "none was accepted" for the share of bad accepted parts
+    if no part was accepted.
     """
     value = getattr(span, name)
     if name in ("first", "last"):
@@ -181,11 +186,12 @@ def _span_cell(name: str, span: "Span") -> str:
 def _error_cell(estimate: "ErrorEstimate") -> str:
     """Return a text on a share of wrong decisions: counts, interval, verdict.
 
-    The verdict says whether the share keeps to the tolerance, is beyond it, or may be beyond it
-    (open). If the interval rests on no outcomes (`n_known` is 0), the counts are left out; if it
-    then also begins at 0 and the verdict is open, the text is "none is known". Known line stops
-    alone can raise its lower end above 0. The interval is rounded outward to 0.1 %. `estimate` has
-    the interval, the verdict, and the counts of the outcomes.
+    The verdict says whether the share keeps to the tolerance (the share that the policy allows), is
+    beyond it, or may be beyond it (open). If the interval rests on no outcomes (`n_known` is 0),
+    the counts are left out; if it then also begins at 0 and the verdict is open, the text is "none
+    is known". Its lower end can then be above 0 only if bad accepted parts stopped the line. The
+    interval is rounded outward to 0.1 %. `estimate` has the interval, the verdict, and the counts
+    of the outcomes.
     """
     if not estimate.n_known and not estimate.lower and estimate.verdict == "open":
         return "none is known"

@@ -75,12 +75,13 @@ def _change_and_print(
     """Open the store's engine, call `change` with it and the author, and print what changed.
 
     `change` returns a `Changed`, whose text is printed after the engine was closed, with the number
-    of the event; the text may say that nothing changed. With `--json` a document is printed
-    instead, which also has the policy and the certificate after the change. `allow_import` permits
-    to import the reducer or rule, module:Class, that the store names. The engine waits up to 10 s
-    for the disk or database. Raises the errors of `DataEngine.open` (StoreError if an engine runs
-    on the robot cell), those of `certificate`, and whatever `change` raises; nothing is printed
-    then. An error of `certificate` comes after the change, which stays.
+    of the event that records the change; the text may say that nothing changed. With `--json` a
+    document is printed instead, which also has the policy and the certificate (the bounds on the
+    shares of wrong decisions) after the change. `allow_import` permits to import the reducer or
+    rule, module:Class, that the store names. The engine waits up to 10 s for the disk or database.
+    Raises the errors of `DataEngine.open` (StoreError if an engine runs on the robot cell), those
+    of `DataEngine.certificate`, and whatever `change` raises; nothing is printed then. An error of
+    `certificate` comes after the change, which stays.
     """
     from ..engine.engine import DataEngine
     from ..store.opening import LONG_WAIT
@@ -107,14 +108,15 @@ def report(part: str, label: str, **changing: Any) -> None:
 
     Name the part by its number, or by the id of its decision. The number is enough if the part has
     one decision, or one that is no reject; otherwise it is refused, and so is a part that is not in
-    the store. For an accepted part, bad is a line stop, and good a confirmation. For a rejected
-    part the label is that of an inspection: the engine trains on it, and the rule does not learn
-    it. An event records the report. A retrain that is due then runs. The label that the decision
-    has already, reported or corrected, changes nothing. Another label is refused with exit code 1,
-    unless it is a line stop after a confirmation, and so is any label after `dengine forget`;
-    `dengine correct` puts either right. Only the newest 20 decisions on the part are looked at. The
-    subcommand is refused while an engine runs on the robot cell. A store that names a reducer or
-    rule of your own, module:Class, needs --allow-import.
+    the store. For an accepted part, bad is a line stop (the part stopped the line), and good a
+    confirmation. For a rejected part the label is that of an inspection: the engine trains on it,
+    but the rule that accepts and rejects does not learn from it. An event in the store's log
+    records the report. A retrain that is due then runs. The label that the decision has already,
+    reported or corrected, changes nothing. Another label is refused with exit code 1, unless it is
+    a line stop after a confirmation, and so is any label after `dengine forget`, which withdraws
+    labels; `dengine correct` puts either right. Only the newest 20 decisions on the part are looked
+    at. The subcommand is refused while an engine runs on the robot cell. A store that names a
+    reducer or rule of your own, module:Class, needs --allow-import.
     """
     from ..engine.corrections import Changed
     from ..history.explain import find_decision_id
@@ -146,11 +148,12 @@ def report(part: str, label: str, **changing: Any) -> None:
 def correct(part: str, label: str, **changing: Any) -> None:
     """Correct a wrong label: the part was good, or bad.
 
-    The part is named as for `dengine report`. From now on its decision counts with the corrected
-    label. The label as it was reported stays in the store, and so does the decision; the correction
-    is a later row, and an event. A label that `dengine forget` left out counts again. If this label
-    counts already, nothing changes. An unknown decision, and one without a label, is refused with
-    exit code 1. The subcommand is refused while an engine runs on the robot cell.
+    The part is named by its number, or by the id of its decision, as for `dengine report`. From now
+    on its decision counts with the corrected label. The label as it was reported stays in the
+    store, and so does the decision; the correction is a later row, and an event in the store's log.
+    A label that `dengine forget` withdrew counts again. If the corrected label counts already,
+    nothing changes. An unknown decision, and one without a label, is refused with exit code 1. The
+    subcommand is refused while an engine runs on the robot cell.
     """
     from ..history.explain import find_decision_id
 
@@ -215,17 +218,21 @@ def release(**changing: Any) -> None:
 def policy(store: str, settings: dict[str, Any], author: str, allow_import: bool) -> None:
     """Show the policy in force, or change it.
 
-    Without options it is shown, even while an engine runs on the robot cell; a change is refused
-    then. A change is recorded as an event; settings that are in force already change nothing. A
-    setting that is not given stays as it is, but --prices without --guarantee also changes the
-    guarantee local or pooled to cost, and then an audit rate of 0 to 0.05, unless --audit-rate is
-    given. Earlier decisions keep their bounds. The certificate, which bounds the share of wrong
-    decisions, starts again after any change. The rule also forgets what it learned, after a change
-    of --alpha, --lower-bound, --interval, --guarantee, --stops or --prices, and, under pooled or
-    cost with --stops some, of --audit-rate: a tolerance that is chosen after the data was seen
-    needs fresh evidence. A store whose engine needs a model or reducer that was handed in as an
-    object is refused, with and without options. Shadow mode lasts over restarts; `dengine status`
-    counts what the model would have done, and how much of it was wrong.
+    The policy is the settings of the decisions. Without options it is shown, even while an engine
+    runs on the robot cell; a change is refused then. A change is recorded as an event in the
+    store's log; settings that are in force already change nothing. A setting that is not given
+    stays as it is, with one exception: --prices without --guarantee also changes the guarantee from
+    local or pooled to cost, and then the audit rate (the share of parts of which the model is
+    certain and that are verified all the same) from 0 to 0.05, unless --audit-rate is given.
+
+    Earlier decisions keep their bounds. The certificate, which bounds the share of wrong decisions,
+    starts again after any change. The rule also forgets what it learned, after a change of --alpha,
+    --lower-bound, --interval, --guarantee, --stops or --prices, and, under pooled or cost with
+    --stops some, of --audit-rate: a tolerance (the share of wrong decisions that is allowed) that
+    is chosen after the data was seen needs fresh evidence. A store whose engine needs a model or
+    reducer that was handed in as an object is refused, with and without options. Shadow mode
+    (--shadow on) lasts over restarts; `dengine status` counts what the model would have done, and
+    how much of it was wrong.
     """
     if settings:
         _change_and_print(
@@ -251,12 +258,14 @@ def policy(store: str, settings: dict[str, Any], author: str, allow_import: bool
 def retrain(store: str, author: str, allow_import: bool) -> None:
     """Train now, on the store's labels with all corrections.
 
-    An event records it, also if the version is dropped. A version that `dengine rollback` pinned is
-    released first, and stays released if the new version is dropped. If the recipe's time budget
-    ends before the training does, the output says how many steps are to go, and the next retrain
-    continues. If the training fails or has no label to train on, or the new version fails its tests
-    or cannot be stored, it is dropped, the previous version stays in use, and the exit code is 1.
-    The subcommand is refused while an engine runs on the robot cell.
+    A version is a trained model. An event in the store's log records the training, also if its
+    version is dropped. If `dengine rollback` pinned a version, so that no automatic retrain
+    replaces it, this ends first, and has ended also if the new version is dropped. If the time that
+    a retrain may take (the recipe's time budget) ends before the training does, the output says how
+    many steps are to go, and the next retrain continues. If the training fails or has no label to
+    train on, or the new version fails its tests or cannot be stored, it is dropped, the previous
+    version stays in use, and the exit code is 1. The subcommand is refused while an engine runs on
+    the robot cell.
     """
     from ..engine.engine import DataEngine
     from ..experiments.tables import retrain_line
@@ -309,15 +318,15 @@ def verify(
     """Check that a store's history is what was written.
 
     Every row is compared with its checksum, and every entry of the ledger, a chain of digests over
-    the rows, with its rows. The subcommand lists damage of an SQLite file, rows, settings and
-    entries that were changed, added or removed, damaged or missing records of a journal, data that
-    was lost and that nobody has acknowledged, and a --expect that the history does not hold, at
-    most 20 in all (--json: each that was found). If there are any, the exit code is 1. For each
-    cell it shows the number of entries and rows, and the newest digest: keep it elsewhere for
-    --expect. It also says if a cell's journal is missing or cannot be read, or holds records that
-    the store lacks; none of these alone is a fault. The subcommand writes rows only with
-    --acknowledge, after which it checks again (an SQLite file is set to WAL mode if it is not).
-    Engines may run meanwhile.
+    the rows, with its rows. The subcommand lists what is wrong, at most 20 faults (--json: all):
+    damage of an SQLite file; rows, settings and entries that were changed, added or removed;
+    damaged or missing records of a journal (the file on a cell's disk that gets each record before
+    the store does); data that was lost and that nobody has acknowledged; and a digest, --expect,
+    that the history does not hold. If there are any, the exit code is 1. For each cell it shows the
+    number of entries and rows, and the newest digest: keep it elsewhere for --expect. It also says
+    if a cell's journal is missing or cannot be read, or holds records that the store lacks; none of
+    these alone is a fault. The subcommand writes rows only with --acknowledge, after which it
+    checks again (an SQLite file is set to WAL mode if it is not). Engines may run meanwhile.
     """
     from ..store.sql import SqlStore
     from ..store.verification import verify_history
@@ -340,10 +349,11 @@ def verify(
 def _verification_lines(report: HistoryReport) -> list[str]:
     """Return the lines that say what a check of a store's history found.
 
-    For each cell they say how many entries and rows it has, its newest digest, and, if so, that its
-    journal is not here (this is also said of one that cannot be read) or holds records. Then come
-    the differences that it found (`report.faults`), at most 20, how many more there are, and
-    whether everything is as it was written.
+    For each robot cell they say how many rows it has, how many entries its ledger (a chain of
+    digests over the rows), and the newest digest. They also say if the cell's journal, the file
+    that gets each record before the store does, is not here or cannot be read, or holds records
+    that the store lacks. Then come the differences that were found (`report.faults`), at most 20,
+    how many more there are, and whether everything is as it was written.
     """
     lines = []
     for cell in report.cells:
@@ -390,13 +400,14 @@ def _verification_lines(report: HistoryReport) -> list[str]:
 def backup(store: str, out: Path) -> None:
     """Copy a store while it is in use.
 
-    The copy is one file with all robot cells and with the contents of the journals that lie beside
-    the store, which a plain copy of the file lacks. It can be opened, and checked by `dengine
-    verify`, wherever it is. Damaged records of a journal are left out, and a record that
-    contradicts the store becomes an event of kind "dead letter" in the copy. Cells without a
-    journal are named. A store in PostgreSQL is refused (pg_dump copies it), and so are an --out
-    that exists, a journal that cannot be read, and one with records, if the cell's ledger has
-    another key than the file that DENGINE_LEDGER_KEY names.
+    The copy is one file with all robot cells and with the records in the journals that lie beside
+    the store; a plain copy of the file lacks these. A journal is the file on a cell's disk that
+    gets each record before the store does. The copy can be opened, and checked by `dengine verify`,
+    wherever it is. Damaged records of a journal are left out, and a record that contradicts the
+    store becomes an event of kind "dead letter" in the copy. Cells without a journal are named. A
+    store in PostgreSQL is refused (pg_dump copies it), and so are an --out that exists, a journal
+    that cannot be read, and one with records, if the cell's ledger (a chain of digests over the
+    rows) has another key than the file that DENGINE_LEDGER_KEY names.
     """
     from ..store.backup import backup_store
 
@@ -425,14 +436,15 @@ def backup(store: str, out: Path) -> None:
 def restore(copy: str, store: Path) -> None:
     """Put a backup in the place of a store.
 
-    COPY is what `dengine backup` wrote, on this or another machine. It is checked first; if
-    `dengine verify` would find a fault in it, even lost data alone that nobody has acknowledged, if
-    its ledger has another key than the file that DENGINE_LEDGER_KEY names, or if --store exists, it
-    is refused with exit code 1. Beside --store each robot cell gets a journal. It names the newest
-    entry of the cell's ledger, by which the next engine sees that the store is complete. A journal
-    that is there already stays, and that engine takes from it what the copy lacks; if the journal
-    names entries that the copy lacks, it raises an alarm. Records of journals beside COPY are added
-    to the store. If a journal cannot be made, the exit code is 1, and the store stays.
+    COPY is what `dengine backup` wrote, on this or another machine. It is checked first. It is
+    refused with exit code 1 if `dengine verify` would find a fault in it, even lost data alone that
+    nobody has acknowledged, if its ledger (a chain of digests over the rows) has another key than
+    the file that DENGINE_LEDGER_KEY names, or if --store exists. Beside --store each robot cell
+    gets a journal, the file that gets each record before the store does. It names the newest entry
+    of the cell's ledger, by which the next engine sees that the store is complete. A journal that
+    is there already stays, and that engine takes from it what the copy lacks; if the journal names
+    entries that the copy lacks, it raises an alarm. Records of journals beside COPY are added to
+    the store. If a journal cannot be made, the exit code is 1, and the store stays.
     """
     from ..store.backup import restore_store
 
@@ -457,12 +469,14 @@ def restore(copy: str, store: Path) -> None:
 def import_labels(journal: Path, store: str, any_model: bool) -> None:
     """Import the labels of an exported model's program.
 
-    JOURNAL is the CSV file that the program wrote. Each line counts once, however often it is
-    imported; a label that contradicts the store's is counted, but not stored. If the policy in the
-    store has --stops all (every bad accepted part stops the system), an accepted part without a
-    report is imported as good, unless it is the last part; with --stops some it is imported without
-    a label. Other parts without a label are left out. A part whose trace has a fault is stored, but
-    never used in training.
+    An exported model decides in a robot cell without the engine, and the program that runs it
+    writes JOURNAL, a CSV file. Each line counts once, however often it is imported; a label that
+    contradicts the store's is counted, but not stored. If the policy in the store has --stops all
+    (every bad accepted part stops the system), an accepted part without a report is imported as
+    good, unless it is the last part; with --stops some it is imported without a label. Other parts
+    without a label are left out. A part whose trace has a fault (like a NaN, or equal samples) is
+    stored, but never used in training.
+
     If a line was changed or is missing, the lines before it are imported, the others are not, and
     the exit code is 1. A file that is no journal, has no accepted or labelled part, has a line that
     cannot be read, or belongs to another model (unless --any-model, or the store records no export)

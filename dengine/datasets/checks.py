@@ -20,11 +20,12 @@ from .table import Recording
 def check_description(description: Description) -> None:
     """Raise DataError unless recordings can be read by a description; no file is looked at.
 
-    No key may have the value `?`, except in `[ignored]` and `[[check]]`. The number of samples of a
-    trace must be 1 or more. There must be a channel, and all channels must have the same `limit`,
-    the range of the sensor. With `order` "time" there must be a column of times. The settings in
-    `[time]` and `[text]` must pass `check_forms`. Nothing else is checked: neither a trigger nor an
-    expression, nor whether columns exist.
+    A description says how recordings are read. No key may have the value `?` (not known yet),
+    except in `[ignored]` and `[[check]]`. The number of samples of a trace must be 1 or more. There
+    must be a channel, and all channels must have the same `limit`, the range of the sensor. If the
+    `order` of the parts is "time", there must be a column of times. The settings in `[time]` and
+    `[text]` must pass `check_forms`. Nothing else is checked: neither a trigger (the condition at
+    which a part begins) nor an expression, nor whether columns exist.
     """
     if open_keys := description.open_keys:
         raise DataError(f"Expected a description without ?, still open: {listed(open_keys)}.")
@@ -44,12 +45,13 @@ def check_description(description: Description) -> None:
 def check_forms(clock: Clock, text: TextForm) -> None:
     """Raise DataError unless files can be read with the settings in `[time]` and `[text]`.
 
-    A time zone, if stated, must have a known name, and a rate, if stated, must be between 1 Hz and
-    1 MHz, both included. If there are columns of times, there must be as many formats; what these
-    say is not checked. Python must know the encoding. The delimiter and the decimal mark must be
-    one character each. The decimal mark and the mark of thousands, which may be "", must differ,
-    and be no digit, sign, e or E; the delimiter is not compared with them. `text.data`, the line of
-    the first samples, must be 1 or more.
+    `clock` has the settings in `[time]`, `text` those in `[text]`. A time zone, if stated, must
+    have a known name, and a rate, if stated, must be between 1 Hz and 1 MHz, both included. If
+    there are columns of times, there must be as many formats; what these say is not checked. Python
+    must know the encoding. The delimiter and the decimal mark must be one character each. The
+    decimal mark and the mark of thousands, which may be "", must differ, and be no digit, sign, e
+    or E; the delimiter is not compared with them. `text.data`, the line of the first samples, must
+    be 1 or more.
     """
     with instead(DataError, "Expected a time zone in time.zone", LookupError, ValueError, OSError):
         ZoneInfo(clock.zone or "UTC")

@@ -150,9 +150,10 @@ class Dataset:
     def spec(self) -> TraceSpec:
         """The `TraceSpec` of live traces of the same shape, for `DataEngine(trace=data.spec)`.
 
-        A rate or a unit that is unknown is None; its `columns` are the names of the channels.
-        Raises SettingError if a field of the data set has a value that no trace can have, for
-        example if two channels have the same name.
+        It has the shape, rate, unit and limit of the traces, and as `columns` the names of the
+        channels. Live traces are those that a robot cell records now. A rate or a unit that is
+        unknown is None. Raises SettingError if a field of the data set has a value that no trace
+        can have, for example if two channels have the same name.
         """
         _, channels, samples = self.cube.shape
         return TraceSpec(
@@ -188,8 +189,9 @@ class Dataset:
 
         Its X is a copy, for one channel of shape (n, T). `channels` and `unit` become those of the
         selected channels; all other fields stay. Raises DataError for an unknown name, for no name,
-        and if the channels of the data set have no names, and SettingError if `spec` raises it. A
-        name that comes twice is accepted, but `spec` of the result then raises SettingError.
+        and if the channels of the data set have no names, and SettingError if its property `spec`
+        does. A name that comes twice is accepted, but `spec` of the result then raises
+        SettingError.
         """
         names = ", ".join(self.channels) or "none, its channels have no names"
         expect_data(
@@ -209,10 +211,12 @@ class Dataset:
     def cut(self, samples: int) -> "Dataset":
         """Return a data set with only the first `samples` samples of each trace.
 
-        If `fit` is "pad" and the traces become shorter, it becomes "cut" in the result; all other
-        fields stay, `lengths` too. Its X may share its memory with that of this data set. Raises
-        DataError if `samples` is below 1, if the traces are shorter, or if `fit` is "resample" and
-        they would become shorter: their first samples are not those of the recordings.
+        The field `fit` says what is done with live traces of another length. If it is "pad" and the
+        traces become shorter, it becomes "cut" in the result; all other fields stay, also
+        `lengths`, the lengths of the recordings. Its X may share its memory with that of this data
+        set. Raises DataError if `samples` is below 1, if the traces are shorter, or if `fit` is
+        "resample" and they would become shorter: their first samples are not those of the
+        recordings.
         """
         most = self.X.shape[-1]
         least = most if self.fit == "resample" else 1

@@ -103,34 +103,42 @@ class DecisionModule(nn.Module):
     def decide(self, trace: Tensor, part: int = 0) -> DecisionFields:
         """Decide on one trace, and make this the pending decision: its outcome is not known yet.
 
-        Before that, an accept that is still pending is settled (`settle`): it is learned as good,
-        or counts as unreported. Any other pending decision is discarded. After a faulty trace no
-        decision is pending. Afterwards `predicted` returns what the model alone would have done. If
-        the decider raises, the accept is settled already.
+        Before that, an accept that is still pending is settled (`settle`): with `stops_all` (every
+        bad accepted part is reported) it is learned as good, otherwise it counts as unreported. Any
+        other pending decision is discarded. After a faulty trace (NaN, infinite, constant, too
+        large or at the sensor's limit) no decision is pending. Afterwards `predicted` returns what
+        the model alone would have done, without force limits (an operator's limits of the signal)
+        and audits (random checks of parts about which the model is certain). If the model raises,
+        the accept is settled already.
 
         Parameters
         ----------
         trace : Tensor of any real dtype, shape (T,) or (C, T)
             Another T is cut, padded or resampled, or refused, as `TraceSpec.fit` says.
         part : int, default 0
-            Hash of its part's number (`folds.part_hash`); 0 for an unknown part.
+            Hash of the number by which a user names the part (`folds.part_hash`), 0 if it has none.
+            References (labelled points) of this part do not count; without a number, those of equal
+            traces.
 
         Returns
         -------
         action, reason : int
-            Positions in `Action` and `Reason`.
+            Action: 0 verify (the part needs the slow check), 1 accept, 2 reject. Reason: position
+            in `Reason`.
         lower, upper : float
-            Bound on the success probability; (0, 1) for a faulty or a novel trace, or if a force
-            limit decides.
+            Bound on the probability that the part is good; (0, 1) for a faulty trace, for a novel
+            one (unlike all training traces), or if a force limit decides.
         n_success, n_failure : int
-            Labels within the radius; 0 for a faulty or a novel trace, or if a force limit decides.
+            Good and bad labels within the radius; 0 for a faulty or a novel trace, or if a force
+            limit decides.
         embedding : Tensor of float32, shape (K, d)
-            NaN for a faulty trace, which is verified.
+            A point in each of the K embedding spaces; NaN for a faulty trace, which is verified.
 
         Raises
         ------
         ValueError
-            For another shape; nothing changes then. Compiled, it is a torch.jit.Error.
+            For another shape, or a T that is refused; nothing changes then. Compiled, it is a
+            torch.jit.Error.
         """
         x = self.as_trace(trace)
         self.settle()
@@ -153,31 +161,33 @@ class DecisionModule(nn.Module):
     def learn(self, trace: Tensor, success: bool, part: int = 0) -> int:
         """Learn the outcome of a part: update the decision rule, and make the trace a reference.
 
-        If the trace and its part are those of the pending decision, its bound is used, and no
-        decision is pending afterwards. Otherwise the trace is first decided on, because a bound
-        must be computed before the label is known; the pending decision then stays pending, and is
-        not settled. A faulty trace is ignored: nothing changes. If the index is full, its oldest
-        reference is dropped. The rule also learns how many accepts were unreported since the last
-        label, and this count restarts at 0.
+        A reference is a labelled point with which later traces are compared; if there is no room,
+        the oldest is dropped. If the trace and its part are those of the pending decision (whose
+        outcome is not known yet), its bound on the success probability is used, and no decision is
+        pending afterwards. Otherwise the trace is first decided on, because a bound must be
+        computed before the label is known; the pending decision then stays pending. The rule also
+        learns how many accepted parts had no report since the last label, and this count restarts
+        at 0. A faulty trace (NaN, infinite, constant, too large or at the sensor's limit) is
+        ignored: nothing changes.
 
         Parameters
         ----------
         trace : Tensor of any real dtype, shape (T,) or (C, T)
             Another T is cut, padded or resampled, or refused, as `TraceSpec.fit` says.
         success : bool
-            The label.
+            The label: whether the part is good.
         part : int, default 0
-            Hash of its part's number; 0 for an unknown part.
+            Hash of the number by which a user names the part (`folds.part_hash`), 0 if it has none.
 
         Returns
         -------
         int
-            Number of references (labelled points) afterwards.
+            Number of references afterwards.
 
         Raises
         ------
         ValueError
-            For another shape. Compiled, it is a torch.jit.Error.
+            For another shape, or a T that is refused. Compiled, it is a torch.jit.Error.
         """
         x = self.as_trace(trace)
         fault, content = self.decider.check(x)
@@ -208,10 +218,11 @@ class DecisionModule(nn.Module):
         """End the wait for the outcome of a pending accept; return whether it was learned as good.
 
         A pending accept is the part decided last, if it was accepted and nothing was reported on
-        it. With `stops_all` (every line stop is reported) it is learned as good: the decision rule
-        is updated, and the trace becomes a reference. Otherwise `n_unreported` grows by 1. Then no
-        decision is pending. If the pending decision is no accept, or there is none, nothing
-        changes.
+        it. With `stops_all` (every bad accepted part is reported, so silence means good) it is
+        learned as good: the decision rule is updated, and the trace becomes a reference (a labelled
+        point with which later traces are compared). Otherwise `n_unreported`, the count of such
+        parts, grows by 1. Then no decision is pending. If the last decision was no accept, or no
+        decision is pending, nothing changes, and False is returned.
         """
         pending = self.pending
         if pending is None or pending.action != ActionCode.ACCEPT.value:
@@ -238,13 +249,17 @@ class DecisionModule(nn.Module):
     ) -> None:
         """Make an earlier decision, which a journal holds, the pending decision again.
 
-        A pending accept is first settled by `settle`; any other pending decision is discarded. The
-        trace, (T,) or (C, T), is embedded anew. `action` (0 verify, 1 accept, 2 reject), `reason`
-        (a position in `Reason`) and the bound, `lower` and `upper`, are taken as they are given;
-        `part` is the hash of the part, 0 if unknown. What the model alone would have done is VERIFY
-        if a force limit decided, the action of the rule as it is now on this bound if the part was
-        audited, else `action`. After a faulty trace no decision is pending. Raises ValueError, or
-        torch.jit.Error if compiled, for another shape.
+        The outcome of a pending decision is not known yet. If an accept is pending already, it is
+        settled first (`settle`): learned as good, or counted as unreported. Any other pending
+        decision is discarded. The trace, (T,) or (C, T), is embedded anew. `action` (0 verify, 1
+        accept, 2 reject), `reason` (a position in `Reason`) and the bound on the success
+        probability, `lower` and `upper`, are taken as they are given; `part` is the hash of the
+        part's number, 0 if it has none. What `predicted` returns afterwards, the action of the
+        model alone, is `action`, with two exceptions: VERIFY if a force limit (an operator's limit
+        of the signal) decided, and what the rule now makes of this bound if the part was audited
+        (checked at random although the model was certain). After a faulty trace (NaN, infinite,
+        constant, too large or at the sensor's limit) no decision is pending. Raises ValueError, or
+        torch.jit.Error if compiled, for another shape, or a T that `TraceSpec.fit` refuses.
         """
         x = self.as_trace(trace)
         self.settle()
@@ -285,13 +300,17 @@ class DecisionModule(nn.Module):
     def learn_outcome(self, decided: DecidedTrace, success: bool) -> None:
         """Update the decision rule with an outcome, and make the trace a reference.
 
-        `decided` is the decision, from before the label was known, and `success` the label. The
-        hash of the part (of the content of its trace, if the part is unknown) gives the part's fold
-        k, and the reference is put into embedding space k. The rule gets as inclusion probability
-        the audit rate if the part was audited, 1 if it was verified for another reason, and 0 if it
-        was accepted or rejected. It also gets whether the trace was novel, and `n_unreported`, the
-        number of accepted parts without a report since the last label, which restarts at 0. If the
-        index is full, its oldest reference is dropped. `pending` is not changed.
+        `decided` is the decision, from before the label was known, and `success` the label. A
+        reference is a labelled point with which later traces are compared. The hash of the part's
+        number (of the content of its trace, if it has none) gives the part's fold k, one of K
+        permanent groups, and the reference is put into embedding space k, which was trained without
+        the labels of fold k. If there is no room, the oldest reference is dropped. The rule gets
+        the bound, the label, what the model alone would have done, and the probability with which
+        the outcome would be asked for: the audit rate if the part was audited (checked at random
+        although the model was certain), 1 if it was verified for another reason, and 0 if it was
+        accepted or rejected. It also gets whether the trace was novel (unlike all training traces),
+        and `n_unreported`, the number of accepted parts without a report since the last label,
+        which restarts at 0. `pending` is not changed.
         """
         inclusion_probability = 0.0
         if decided.action == ActionCode.VERIFY.value:
@@ -308,12 +327,13 @@ class DecisionModule(nn.Module):
         self.n_unreported = 0
 
     def as_trace(self, trace: Tensor) -> Tensor:
-        """Return a trace (T,) or (C, T) as (C, T) float32 with the samples that the decider takes.
+        """Return a trace (T,) or (C, T) as (C, T) float32, with the number of samples of the model.
 
         Another number of samples is cut, padded or resampled, as `TraceSpec.fit` says. A trace that
         has the right shape and dtype already, and is contiguous, is not copied. NaN and infinities
         pass. Raises ValueError, or torch.jit.Error if compiled, for a number of samples that cannot
-        be fitted in this way, for no samples, and for another shape.
+        be fitted in this way, for no samples, and for another number of channels C or of
+        dimensions.
         """
         x = trace.unsqueeze(0) if trace.dim() == 1 else trace
         fits = x.numel() > 0 and can_fit_length(x.size(-1), self.samples, self.fit)

@@ -68,10 +68,11 @@ def export_onnx(
 ) -> Path:
     """Write the decision of an engine, or of a fitted model, as ONNX, with its checksum beside it.
 
-    The file is written only if onnxruntime decides on random traces as the model does. An engine's
-    store records the export as an event, before the file is written. A damaged trace among those
-    whose embeddings are compared is left out, and an event is written, too. While torch makes the
-    program, Python's warnings, and log messages up to level WARNING, are off in the whole process.
+    The file is written only if onnxruntime decides on random traces as the model does. For an
+    engine, the export is recorded in the log of its store, before the file is written. Up to eight
+    labelled traces are read from the store, to compare embeddings; a damaged trace (not as it was
+    stored) is left out, which is logged in the store, too. While torch makes the program, Python's
+    warnings, and log messages up to level WARNING, are off in the whole process.
 
     Parameters
     ----------
@@ -79,9 +80,9 @@ def export_onnx(
     path : path-like
         The checksum is written beside it, as PATH.sha256.
     trace : TraceSpec, optional
-        Needed for a `ModelPrediction` whose traces have another rate or limit than the defaults of
-        `TraceSpec`. Its shape must be that of the model's traces. None: the engine's `TraceSpec`,
-        or the shape of the model's traces.
+        What the traces look like. Needed for a `ModelPrediction` whose traces have another sampling
+        rate or sensor limit than the defaults of `TraceSpec`. Its shape must be that of the model's
+        traces. None: the engine's `TraceSpec`, or the shape of the model's traces.
     key : path-like, optional
         File of a key (`make_key`); the signature is written beside the file, as PATH.sig.
     force : bool, default False
@@ -96,15 +97,17 @@ def export_onnx(
     Raises
     ------
     ExportError
-        If the engine audits (checks some parts that the model is certain of) or is in shadow mode,
-        has force limits or a decision rule other than that of the guarantee "local" with stops
-        "some", or if a part is among the references more than once; the message names all of these
-        that apply. Also if nothing was trained yet; for a baseline; if `trace` has another shape
-        than the model's traces; if the reducer, the interval or the rule cannot be exported; if the
-        compiled decision and the reducer give a trace different embeddings; if the rule is stale,
-        because an update of it failed; if the store was changed from outside; if the key cannot be
-        read or has fewer than 16 bytes; if a package is missing; and if onnxruntime does not decide
-        like the model. Other errors of torch and onnxruntime are raised as they are.
+        If the engine audits (checks some parts at random although the model is certain) or is in
+        shadow mode (checks every part), has force limits (an operator's limits of the signal) or a
+        decision rule that learns (any but that of the guarantee "local" with stops "some"), or if a
+        part is among the references (labelled points) more than once; the message names all of
+        these that apply. Also if nothing was trained yet; for a baseline (a model that was handed
+        in to the engine); if `trace` has another shape than the model's traces; if the reducer, the
+        confidence interval or the rule cannot be exported; if the compiled decision and the reducer
+        give a trace different embeddings; if the rule is stale, because an update of it failed; if
+        the store was changed from outside (its rows do not fit their checksums); if the key cannot
+        be read or has fewer than 16 bytes; if a package is missing; and if onnxruntime does not
+        decide like the model. Other errors of torch and onnxruntime are raised as they are.
     SettingError
         If the engine's force limits do not fit `trace`.
     OutputError
@@ -130,7 +133,8 @@ def export_onnx(
 def load_onnx(path: FilePath, *, key: FilePath | None = None) -> "OnnxModel":
     """Check an ONNX file, load it into onnxruntime on one thread, and decide once, to warm it up.
 
-    Unlike `load_exported` it does not compare the embedding of a test trace with the file's.
+    Unlike `load_exported` it does not compare the embedding of a test trace with the one in the
+    file.
 
     Parameters
     ----------
@@ -148,8 +152,8 @@ def load_onnx(path: FilePath, *, key: FilePath | None = None) -> "OnnxModel":
     ExportError
         For a file that is missing, has no checksum beside it (PATH.sha256), is damaged or not
         signed with the key, a key that cannot be read or has fewer than 16 bytes, a file that is no
-        ONNX export, has another schema or is refused by onnxruntime, and if a package for ONNX is
-        missing.
+        ONNX export, has another schema (version of its description) or is refused by onnxruntime,
+        and if a package for ONNX is missing.
     """
     _require_packages()
     import onnx
@@ -168,9 +172,11 @@ def load_onnx(path: FilePath, *, key: FilePath | None = None) -> "OnnxModel":
 def _refuse_unsupported(source: Exportable) -> None:
     """Raise ExportError if the decision needs something that ONNX cannot carry, and name it all.
 
-    ONNX cannot carry an audit rate above 0 (the rate is 1 in shadow mode), a decision rule other
-    than that of the guarantee "local" with stops "some" (also a user's own rule), a part that is
-    among the references more than once, and force limits.
+    `source` is the model with its settings. ONNX cannot carry audits (random checks of parts about
+    which the model is certain), shadow mode (every part is checked), a decision rule other than
+    that of the guarantee "local" with stops "some", which learns nothing (also a user's own rule),
+    a part that is among the references (labelled points) more than once, and force limits (an
+    operator's limits of the signal).
     """
     rule = type(source.model.rule)  # a user's own as well: `OnnxDecision` knows the paper's alone
     n_repeats = int(source.model.index.repeats)
@@ -222,11 +228,14 @@ class OnnxModel:
     def decide(self, trace: ArrayLike) -> ExportedDecision:
         """Decide on one trace, (T,) or (C, T), and keep nothing of it.
 
-        Returns action, reason, lower, upper, n_success, n_failure and embedding (K, d). Another T
-        is cut, padded or resampled, or refused, as `TraceSpec.fit` says. A faulty trace, or a novel
-        trace, which is unlike all traces of the training, is verified, with the bound (0, 1) and no
-        labels, and its reason says so; the embedding of a faulty trace is NaN. Raises TraceError
-        for a wrong shape, a T that is refused, and values that are no real numbers.
+        Returns action, reason, the bound on the success probability (lower, upper), the numbers of
+        good and bad labels nearby (n_success, n_failure) and the embedding (K, d), a point in each
+        of K spaces. Another T is cut, padded or resampled, or refused, as `TraceSpec.fit` says. A
+        faulty trace (NaN, infinite, constant, too large or at the sensor's limit), or a novel
+        trace, which is unlike all traces of the training, gets the action VERIFY (the part needs
+        the slow check), with the bound (0, 1) and no labels, and its reason says so; the embedding
+        of a faulty trace is NaN. Raises TraceError for a wrong shape, a T that is refused, and
+        values that are no real numbers.
         """
         action, reason, *counted, z = self.session.run(None, {"trace": as_trace(trace, self.trace)})
         return ExportedDecision._make(
@@ -265,10 +274,12 @@ class OnnxDecision(nn.Module):
     def forward(self, trace: Tensor) -> tuple[Tensor, ...]:
         """Decide on one trace (C, T) of float32; return a tuple of seven tensors.
 
-        They are action (0 verify, 1 accept, 2 reject), reason (position in `Reason`), lower, upper,
-        n_success, n_failure and embedding. They have no dimension, except the embedding (K, d),
-        which is NaN for a faulty trace. A faulty or a novel trace is verified, with the bound
-        (0, 1) and no labels.
+        They are action (0 verify, which asks for the slow check, 1 accept, 2 reject), reason
+        (position in `Reason`), the bound on the success probability (lower, upper), the numbers of
+        good and bad labels nearby (n_success, n_failure) and embedding. They have no dimension,
+        except the embedding (K, d), a point in each of K spaces, which is NaN for a faulty trace. A
+        faulty trace (see `fault`) or a novel one (unlike all training traces) is verified, with the
+        bound (0, 1) and no labels.
         """
         fault = self.fault(trace)
         is_sound = fault == 0
@@ -294,8 +305,9 @@ class OnnxDecision(nn.Module):
     def fault(self, trace: Tensor) -> Tensor:
         """Return the position in `Reason` of what is wrong with a trace, () int64; 0 if nothing is.
 
-        Only the first fault that applies is returned: not finite, constant, at the sensor's limit,
-        too large (beyond 1e18). The result is the same as in an engine (`TraceGate`).
+        Only the first fault that applies is returned, in this order: a sample is not finite, all
+        samples are equal, a sample is at or beyond the sensor's limit, a sample is too large
+        (beyond 1e18). The result is the same as in an engine (`TraceGate`).
         """
         low = trace.min()
         high = trace.max()
@@ -309,10 +321,11 @@ class OnnxDecision(nn.Module):
     def count(self, distances: Tensor) -> tuple[Tensor, ...]:
         """Count the labels within the radius; return action, lower, upper, n_success, n_failure.
 
-        `distances` are the squared distances to the references, (n,). The results are tensors
-        without a dimension. The action follows from the bound (`lower`, `upper`) by the
-        `DecisionRule`: 1 accept if lower reaches the rule's accept threshold, else 2 reject if
-        upper is at most its reject threshold, else 0 verify. A reference at the radius counts.
+        `distances` are the squared distances to the references (labelled points), (n,). The results
+        are tensors without a dimension. `lower` and `upper` are the ends of the rule's confidence
+        interval of the success probability. The action follows from them by the `DecisionRule`: 1
+        accept if lower reaches the rule's accept threshold, else 2 reject if upper is at most its
+        reject threshold, else 0 verify. A reference at the radius counts.
         """
         is_inside = distances <= self.radius * self.radius
         n_success = (is_inside & (self.labels == 1)).sum()
@@ -356,8 +369,9 @@ def _check_decisions(onnx_model: OnnxModel, model: Any, spec: TraceSpec) -> None
     embedding differs by more than 0.0001 times (1 + the absolute value of the model's coordinate),
     or if the counts of good and bad labels together differ by more than two. If the counts are
     equal, it is also raised if the action differs, or if the differences of the two ends of the
-    bound add up to more than 1e-6. Counts may differ, since a reference may lie exactly at the
-    radius; action and bound are then not compared. The reason is never compared.
+    bound on the success probability add up to more than 1e-6. Counts may differ, since a reference
+    (a labelled point) may lie exactly at the radius within which labels count; action and bound are
+    then not compared. The reason is never compared.
     """
     rng = np.random.default_rng(0)
     shape = (N_CHECKED, spec.channels, spec.samples)

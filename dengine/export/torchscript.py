@@ -61,7 +61,7 @@ TOLERANCE = 1e-4  # of a scaled embedding: another processor may add in another 
 def export_sources(folder: FilePath) -> Path:
     """Write the C and C++ sources that run an exported file, and a file VERSION, into a folder.
 
-    The folder is made if it is missing.
+    VERSION holds the version of dengine. The folder is made, with its parents, if it is missing.
 
     Parameters
     ----------
@@ -96,19 +96,21 @@ def export_torchscript(
 
     The file does not know of a part that the engine accepted and whose outcome is not known yet, so
     it never learns this outcome. Export when no part is under way; this is not checked. The export
-    of an engine is recorded as an event in its store, before the file is written. A damaged trace
-    among those that are compared is left out, and an event is written, too.
+    of an engine is recorded in the log of its store, before the file is written. Up to eight
+    labelled traces are read from the store, to compare embeddings; a damaged trace (not as it was
+    stored) is left out, which is logged in the store, too.
 
     Parameters
     ----------
     engine_or_model : DataEngine or ModelPrediction
-        A model, which must be fitted, exports without audits and force limits.
+        A model, which must be fitted, exports without audits (random checks of parts about which
+        the model is certain) and without force limits (an operator's limits of the signal).
     path : path-like
         The checksum is written beside it, as PATH.sha256.
     trace : TraceSpec, optional
-        Needed for a `ModelPrediction` whose traces have another rate or limit than the defaults of
-        `TraceSpec`. Its shape must be that of the model's traces. None: the engine's `TraceSpec`,
-        or the shape of the model's traces.
+        What the traces look like. Needed for a `ModelPrediction` whose traces have another sampling
+        rate or sensor limit than the defaults of `TraceSpec`. Its shape must be that of the model's
+        traces. None: the engine's `TraceSpec`, or the shape of the model's traces.
     key : path-like, optional
         File of a key (`make_key`); the signature is written beside the file, as PATH.sig.
     force : bool, default False
@@ -124,11 +126,11 @@ def export_torchscript(
     ------
     ExportError
         If nothing was trained yet, for a baseline (a model that was handed in to the engine), if
-        `trace` has another shape than the model's traces, if the reducer, the interval or the
-        decision rule cannot be compiled, if the compiled decision and the reducer map one of up to
-        eight labelled traces to different points, if the rule is stale, because an update of it
-        failed, if the store was changed from outside, and if the key cannot be read or has fewer
-        than 16 bytes.
+        `trace` has another shape than the model's traces, if the reducer, the confidence interval
+        or the decision rule cannot be compiled, if the compiled decision and the reducer map one of
+        up to eight labelled traces to different points, if the rule is stale, because an update of
+        it failed, if the store was changed from outside (its rows do not fit their checksums), and
+        if the key cannot be read or has fewer than 16 bytes.
     SettingError
         If the engine's force limits do not fit `trace`.
     OutputError
@@ -212,28 +214,32 @@ class ExportedModel:
     def decide(self, trace: ArrayLike, part: PartNumber = None) -> ExportedDecision:
         """Decide on one trace, which becomes the pending decision, whose outcome `learn` reports.
 
-        If the part before it was accepted and nothing was reported about it, that part is settled
-        first. If the description says `stops` "all", it is learned as good and becomes a reference.
-        If it says "some", the part is counted as unreported. A VERIFY or REJECT that is still
-        pending is discarded. After a faulty trace no decision is pending.
+        If the part before it was accepted and nothing was reported about it, its wait for an
+        outcome ends first. If the file's description (`metadata`) says `stops` "all" (every bad
+        accepted part is reported), it is learned as good and becomes a reference (a labelled point
+        with which later traces are compared). If it says "some", the part is counted as unreported.
+        A VERIFY or REJECT that is still pending is discarded. After a faulty trace (NaN, infinite,
+        constant, too large or at the sensor's limit) no decision is pending.
 
         Parameters
         ----------
         trace : array, shape (T,) or (C, T)
             Another T is cut, padded or resampled, or refused, as `TraceSpec.fit` says.
         part : str or int, optional
-            Number of the part, whose own references then do not count.
+            Number by which you name the part. The part's own references do not count; without a
+            number, those of equal traces do not.
 
         Returns
         -------
         ExportedDecision
-            Action, reason, bound of the success probability, label counts and embedding.
+            Action (VERIFY asks for the slow check), reason, bound of the success probability,
+            numbers of good and bad labels nearby, and embedding.
 
         Raises
         ------
         TraceError
-            For a wrong shape, values that are no real numbers, or a part that is neither a whole
-            number nor a text of 1 to 200 printable characters.
+            For a wrong shape, a T that is refused, values that are no real numbers, or a part that
+            is neither a whole number nor a text of 1 to 200 printable characters.
         """
         x = torch.from_numpy(as_trace(trace, self.trace))
         with torch.inference_mode():
@@ -246,10 +252,12 @@ class ExportedModel:
     def learn(self, trace: ArrayLike, success: bool, part: PartNumber = None) -> int:
         """Learn the outcome of a part, after its `decide` and before the next.
 
-        The trace becomes a reference (the oldest is dropped if there is no room), the decision rule
-        is updated, and `metadata["references"]` becomes the new number of references. The file on
-        the disk is not changed; see `save`. A faulty trace is ignored. If the trace and the part
-        are those of the pending decision, nothing is pending afterwards; otherwise the model first
+        The trace becomes a reference, a labelled point with which later traces are compared (the
+        oldest is dropped if there is no room), the decision rule is updated, and
+        `metadata["references"]` becomes the new number of references. The file on the disk is not
+        changed; see `save`. A faulty trace (NaN, infinite, constant, too large or at the sensor's
+        limit) is ignored. If the trace and the part are those of the pending decision (the last, if
+        its outcome is not known yet), nothing is pending afterwards; otherwise the model first
         decides on the trace, and the earlier decision stays pending.
 
         Parameters
@@ -257,20 +265,20 @@ class ExportedModel:
         trace : array, shape (T,) or (C, T)
             Another T is cut, padded or resampled, or refused, as `TraceSpec.fit` says.
         success : bool
-            The label.
+            The label: whether the part is good.
         part : str or int, optional
-            Number of the part.
+            Number by which you name the part, the same as in `decide`.
 
         Returns
         -------
         int
-            Number of references.
+            Number of references afterwards.
 
         Raises
         ------
         TraceError
-            For a wrong shape, values that are no real numbers, or a part that is neither a whole
-            number nor a text of 1 to 200 printable characters.
+            For a wrong shape, a T that is refused, values that are no real numbers, or a part that
+            is neither a whole number nor a text of 1 to 200 printable characters.
         ReportError
             For a label that is not True, False, 1 or 0.
         """
@@ -320,7 +328,8 @@ def load_exported(path: FilePath, *, key: FilePath | None = None) -> ExportedMod
     """Check an exported file, load it and warm it up.
 
     Once checksum, signature and description are checked, the calling thread is limited to one torch
-    thread for good, also if the loading fails: it is steadier by far at these sizes.
+    thread for good, also if the loading fails: with a single thread the times of decisions vary far
+    less.
 
     Parameters
     ----------
@@ -337,11 +346,12 @@ def load_exported(path: FilePath, *, key: FilePath | None = None) -> ExportedMod
     ------
     ExportError
         Before anything is loaded: for a file that is missing, damaged, truncated, no export or of
-        another schema, or that was not signed with the key, and for a key that cannot be read or
-        has fewer than 16 bytes. Afterwards: if it is no TorchScript, if its description does not
-        fit its module, or if this machine does not compute the embedding that the file holds for a
-        test trace, up to 0.0001 times (1 + the absolute value) of each coordinate. Errors inside
-        the module, torch.jit.Error or RuntimeError, are raised as they are.
+        another schema (version of its description), or that was not signed with the key, and for a
+        key that cannot be read or has fewer than 16 bytes. Afterwards: if it is no TorchScript, if
+        its description does not fit its module, or if this machine does not compute the embedding
+        that the file holds for a test trace, up to 0.0001 times (1 + the absolute value) of each
+        coordinate. Errors inside the module, torch.jit.Error or RuntimeError, are raised as they
+        are.
     """
     target = Path(path)
     content = read_checked(target, key)
@@ -367,10 +377,11 @@ def load_exported(path: FilePath, *, key: FilePath | None = None) -> ExportedMod
 def _check_golden(model: ExportedModel, path: Path) -> None:
     """Warm a model up on the test trace in its file; raise ExportError for another embedding.
 
-    The test trace and its expected embedding are the entry "golden" of the description. A
-    coordinate may differ by 0.0001 times (1 + its absolute value). Three times the model decides on
-    the trace, learns it as good and learns it as bad. This changes the model and its `metadata`, so
-    pass a copy. `path` is named in the error.
+    The test trace and its expected embedding are the entry "golden" of the file's description
+    (`metadata`). A coordinate may differ by 0.0001 times (1 + its absolute value). Three times the
+    model decides on the trace, learns it as good and learns it as bad. The last embedding is
+    compared. This changes the model and its `metadata`, so pass a copy. `path` is named in the
+    error.
     """
     golden = model.metadata["golden"]
     trace = np.array(golden["trace"], dtype=np.float32)

@@ -49,9 +49,10 @@ def envelope_of(successes: TraceArray, trace: TraceArray) -> Envelope | None:
     -------
     Envelope or None
         n, and at each sample lower edge, median and upper edge (quantiles 0.025, 0.5 and 0.975,
-        linearly interpolated), and the share, of all channels together; a sample at an edge is
-        inside. Where a success is NaN, the edges are NaN, and the sample counts as inside. None for
-        fewer than 20 successes, or if their shape is not the trace's.
+        linearly interpolated), and the share of the trace's samples outside, of all channels
+        together; a sample at an edge is inside. Where a success is NaN, the edges are NaN, and the
+        sample counts as inside. None for fewer than 20 successes, or if their shape is not the
+        trace's.
     """
     if len(successes) < MIN_SUCCESSES or successes.shape[1:] != trace.shape:
         return None

@@ -112,17 +112,18 @@ class Explanation:
 
 
 def find_decision_id(store: SqlStore, part: str) -> str:
-    """Return the id of the only decision on a part that is no REJECT, else of its only REJECT.
+    """Return the id of the only decision on a part; a REJECT counts only if there is no other.
 
-    A rejected part may come again, so REJECT counts only if there is no other decision. Only the
-    newest 20 decisions of this robot cell on the part are looked at.
+    A part that was rejected may come again, so its rejects are passed over if it also has a
+    decision that is no REJECT. Only the newest 20 decisions of this robot cell on the part are
+    looked at.
 
     Parameters
     ----------
     store : SqlStore
     part : str
-        The part's number, which `decide` got; or a decision's id, which is returned if no decision
-        is on a part of this number.
+        The number by which the user named the part in `decide`; or a decision's id, which is
+        returned if no decision is on a part of this number.
 
     Returns
     -------
@@ -133,7 +134,8 @@ def find_decision_id(store: SqlStore, part: str) -> str:
     UnknownDecisionError
         If `part` is neither the number of a decided part nor the id of a decision.
     ReportConflictError
-        If several decisions count; the message has their ids.
+        If several decisions count, that is, several that are no REJECT, or several REJECTs alone;
+        the message has their ids.
     """
     decisions = store.decisions.select(HistoryFilter(part=part), 20)
     matches = [item for item in decisions if item.decision.action is not Action.REJECT] or decisions
@@ -155,9 +157,10 @@ def find_decision_id(store: SqlStore, part: str) -> str:
 def explain(store: SqlStore, decision_id: str, neighbours: int = 10) -> Explanation:
     """Explain one decision from what its store keeps; nothing is trained or embedded.
 
-    The policy is the one that was in force at the decision. A damaged label, and a damaged trace of
-    those that make the envelope (the band of the successes), is left out, and an event is written
-    to the store. Nothing else is written.
+    The policy (the settings of a decision, such as error level and limits) is the one that was in
+    force at the decision. If a label, or a trace of those that make the envelope (the band that
+    contains most traces of good parts), is damaged (not as it was stored), it is left out, and an
+    event is written to the store's log. Nothing else is written.
 
     Parameters
     ----------
@@ -166,27 +169,28 @@ def explain(store: SqlStore, decision_id: str, neighbours: int = 10) -> Explanat
         Id of the decision; or the number of its part, if this robot cell has no decision of this id
         (see `find_decision_id`).
     neighbours : int, default 10
-        Number of nearest references at most. Those of the decision's own part are left out.
+        Number of nearest references (labelled points) at most. Those of the decision's own part are
+        left out.
 
     Returns
     -------
     Explanation
-        Sentences, bounds with their thresholds, the nearest references of the version that decided,
-        and the envelope of good parts; see its attributes.
+        Sentences, bounds with their thresholds, the nearest references of the model version that
+        decided, and the envelope of good parts; see its attributes.
 
     Raises
     ------
     ReportError
         For a decision that the store does not hold (UnknownDecisionError), and for a part with
-        several decisions (ReportConflictError).
+        several decisions that count (ReportConflictError).
     StoreError
         For a store that no engine has used, for a stored recipe that lacks settings, for a damaged
         `TraceSpec`, and for a damaged trace of the decision or of a neighbour.
     SettingError
-        For a stored recipe or policy that cannot be read, if an object of the user's class of rule
-        cannot be made, and for a part outside the force limits if one of them does not fit its
-        trace. An error of the rule's constructor other than TypeError, and what its `observe` and
-        `update` raise, is raised as it is.
+        For a stored recipe or policy that cannot be read, if an object of the user's class of
+        decision rule cannot be made, and for a part outside the force limits (an operator's limits
+        of the signal) if one of them does not fit its trace. An error of the rule's constructor
+        other than TypeError, and what its `observe` and `update` raise, is raised as it is.
     """
     settings = store.settings.read()
     if "recipe" not in settings:
@@ -231,11 +235,12 @@ def explain(store: SqlStore, decision_id: str, neighbours: int = 10) -> Explanat
 
 
 def _find_policy(store: SqlStore, time: float, present: Policy) -> Policy:
-    """Return the policy that was in force at a time, in seconds since 1970.
+    """Return the policy, the settings of decisions, in force at a time, in seconds since 1970.
 
-    It is the policy that the first change of policy after this time replaced; an event without
-    data, which cannot name it, is passed over. If there was no change since, it is `present`, the
-    policy in force now. Raises SettingError if the policy of the event is not valid.
+    It is the policy that the first change of policy after this time replaced, as the store's log of
+    events says; an event without data, which cannot name it, is passed over. If there was no change
+    since, it is `present`, the policy in force now. Raises SettingError if the policy of the event
+    is not valid.
     """
     for event in store.events.newest():
         if event.kind in POLICY_KINDS and event.time > time and event.data is not None:
@@ -246,8 +251,10 @@ def _find_policy(store: SqlStore, time: float, present: Policy) -> Policy:
 def _find_safe_mode(store: SqlStore, item: StoredDecision) -> str:
     """Return why the safe mode in which a decision was made had begun.
 
-    It is the text of the last event that began a safe mode, at the time of the decision or before.
-    "" if the reason of the decision is not `Reason.SAFE_MODE`, or if there is no such event.
+    In a safe mode, after an alarm about wrong decisions or novel traces, parts are checked until
+    outcomes allow decisions again. The result is the text of the last event in the store's log that
+    began a safe mode, at the time of the decision or before. "" if the reason of the decision is
+    not `Reason.SAFE_MODE`, or if there is no such event.
     """
     if item.decision.reason is not Reason.SAFE_MODE:
         return ""
@@ -262,14 +269,15 @@ def _find_neighbours(
 ) -> Iterator[Neighbour]:
     """Yield the nearest references of other parts, at most `n`, with their traces, nearest first.
 
-    Each distance is measured in the embedding space of the reference, in which one radius means the
-    same for every reducer. References of the decision's own part (without a number, of a trace
-    equal to its trace) are left out. Nothing is yielded if `version` is None, or if the trace of
-    the decision was not embedded. A neighbour may lie outside of the radius, which only says what
-    its field `inside` is. If the decision behind a reference is unknown (another robot cell made
-    it, or its label is damaged), its id, part, source and trace are None. `success` is the label
-    that the version had, without later corrections; `source` is the first report's, without any
-    correction. Raises StoreError for a damaged trace.
+    A reference is a labelled point of the model as it was at the decision (`version`); it lies in
+    one of several embedding spaces, and its distance from the decision's trace is measured there.
+    References of the decision's own part (if the part has no number, of traces equal to its trace)
+    are left out. Nothing is yielded if `version` is None, or if the trace of the decision was not
+    embedded. A neighbour may lie outside of the radius; its field `inside` says so. If the decision
+    behind a reference is unknown (another robot cell made it, or its label is damaged), its id,
+    part, source and trace are None. `success` is the label that the version had, without later
+    corrections; `source` says where it came from when it was first reported. Raises StoreError for
+    a trace that is damaged (not as it was stored).
     """
     embedding = item.decision.embedding  # (K, d)
     if version is None or embedding is None:
@@ -302,10 +310,11 @@ def _find_envelope(
 
     The envelope is the band that contains the middle 95 % of these parts' traces at each sample.
     They are taken from the newest MAX_ENVELOPE_LABELS labels (1,000) up to `version.last_seq`, the
-    newest label that the version knew at the decision. If these give no envelope (`envelope_of`
-    returns None), or without a version, they are taken from the newest labels of today. Labels are
-    taken as corrected by now. Traces of the decision's own part (without a number, traces equal to
-    its trace) are left out. So is a damaged trace, and an event is written to the store.
+    newest label that the model version knew at the decision. If these give no envelope (they have
+    fewer than 20 good parts, or traces of another shape), or without a version, they are taken from
+    the newest labels of today. Labels count as corrected by now. Traces of the decision's own part
+    (if it has no number, traces equal to its trace) are left out. So is a trace that is damaged
+    (not as it was stored), and an event is written to the store's log.
     """
     for last in (None if version is None else version.last_seq, None):
         labelled = store.labels.with_traces(MAX_ENVELOPE_LABELS, last=last)
@@ -317,10 +326,12 @@ def _find_envelope(
 
 
 def _note_of(item: StoredDecision, is_kept: bool) -> str:
-    """Return a sentence that says which version's references the neighbours are.
+    """Return a sentence that says of which model version the neighbours of a trace are references.
 
-    Without neighbours it says why, and names the first of these: the trace is quarantined, was not
-    embedded, or the version that decided is not kept (unless `is_kept`).
+    References are the labelled points of a model version. If there are no neighbours, it says why
+    instead, by the first of these that applies: the trace is quarantined (stored, but never used in
+    training), it was not embedded, or the store does not keep the version that decided (`is_kept`
+    is False).
     """
     decision = item.decision
     version = f"version {decision.model_version}, which answered,"

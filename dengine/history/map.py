@@ -76,7 +76,8 @@ def part_map(store: "SqlStore", recipe: Recipe, version: int) -> PartMap:
     """Read the map of the parts, the points of the web page's picture, for a model version.
 
     Known parts are references of the version, the labelled traces with which it compares a new one;
-    newest parts are decisions. A damaged label is left out, and an event is written to the store.
+    newest parts are decisions. Each is drawn at the first two coordinates of its embedding. A label
+    that is damaged (not as it was stored) is left out, and an event is written to the store's log.
 
     Parameters
     ----------
@@ -91,18 +92,18 @@ def part_map(store: "SqlStore", recipe: Recipe, version: int) -> PartMap:
     PartMap
         The known parts are the newest 250 references whose label this robot cell recorded. Their
         labels are as the version had them, or as they were reported later; a later correction does
-        not show. There are none if no such version was put in force, if its state is damaged or no
-        longer kept, or if it has no references (a model that the user handed in). The newest parts
-        come from the cell's newest 10 decisions, of any version: those that this version made and
-        whose trace it embedded, with corrected labels. A part that is both appears once, as a
-        newest part.
+        not show. There are none if no such version was put in force, if its stored arrays are
+        damaged or no longer kept, or if it has no references (a model that the user handed in). The
+        newest parts come from the cell's newest 10 decisions, of any version: those that this
+        version made and whose trace it embedded, with corrected labels. A part that is both appears
+        once, as a newest part.
 
     Raises
     ------
     SettingError
-        For an unknown reducer, and if an object of the user's class of rule cannot be made. An
-        error of the rule's constructor other than TypeError, and what its `observe` and `update`
-        raise, is raised as it is.
+        For an unknown reducer, and if an object of the user's class of decision rule cannot be
+        made. An error of the rule's constructor other than TypeError, and what its `observe` and
+        `update` raise, is raised as it is.
     StoreError
         If the store cannot be read.
     """

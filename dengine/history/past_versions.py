@@ -63,11 +63,12 @@ def load_past_version(
 ) -> PastVersion | None:
     """Load a model version from the store as it was when a decision was made.
 
-    Its references and its rule include this cell's labels that had come by then, as they were
-    reported: later corrections are not applied. Of the labels that came after the version was
-    trained, only those that came before the next version of this robot cell was stored, and at most
-    MAX_LABELS (100,000), are read; they become references if this version was in force when they
-    came. A damaged label is left out, and an event is written to the store.
+    Its references (labelled points) and its decision rule include this robot cell's labels that had
+    come by then, as they were reported: later corrections are not applied. Of the labels that came
+    after the version was trained, only those that came before the next version of this cell was
+    stored, and at most MAX_LABELS (100,000), are read; they become references if this version was
+    in force when they came. A label that is damaged (not as it was stored) is left out, and an
+    event is written to the store's log.
 
     Parameters
     ----------
@@ -75,7 +76,7 @@ def load_past_version(
     version : int
         Number of the version.
     recipe : Recipe
-        The recipe of that moment.
+        The recipe (the settings of the engine) of that moment.
     item : StoredDecision or None
         The decision, with its trace. None: the version with all labels that came before the next
         version of this cell was stored.
@@ -84,17 +85,18 @@ def load_past_version(
     -------
     PastVersion or None
         The references with their labels (None for a label of another cell or a damaged one), the
-        thresholds of the rule, and how novel the trace of the decision was. None if no such version
-        was put in force, if its state is damaged or no longer kept, or if it has no references (a
-        baseline, a model that the user handed in).
+        thresholds of the rule, and how novel (unlike the training traces) the trace of the decision
+        was. None if no such version was put in force, if its stored arrays are damaged or no longer
+        kept, or if it has no references (a model that the user handed in).
 
     Raises
     ------
     StoreError
         If the store cannot be read.
     SettingError
-        If an object of the user's class of rule cannot be made. An error of its constructor other
-        than TypeError, and what its `observe` and `update` raise, is raised as it is.
+        If an object of the user's class of decision rule cannot be made. An error of its
+        constructor other than TypeError, and what its `observe` and `update` raise, is raised as it
+        is.
     """
     try:
         stored = store.versions.load(version)
@@ -132,11 +134,12 @@ def load_past_version(
 def _restore_index(stored: ModelVersion, added: list[PastLabel], recipe: Recipe) -> RadiusIndex:
     """Return the index of a stored version's references, with the labels `added` later.
 
-    A label without a point (the embedding of its trace) is left out. An index is full if older
-    references have been removed from it for lack of room; each added reference then replaces the
-    oldest. Otherwise there is room for as many as the recipe's training window holds, but at least
-    for the stored ones, after which the oldest are replaced, too. The fold of a label is computed
-    from its `content_hash`, the hash of the part's number, or of the trace if it has none.
+    References are labelled points. A label without a point (the embedding of its trace) is left
+    out. The index counts as full if the version had replaced its oldest references for lack of
+    room; each added reference then replaces the oldest. Otherwise there is room for `recipe.window`
+    references, but at least for the stored ones, after which the oldest are replaced, too. A
+    reference lies in the embedding space of its fold, a group that follows from the label's
+    `content_hash`: the hash of the part's number, or of the trace if it has none.
     """
     n = stored.state["points"].shape[1]
     spaces = len(stored.state["scale"])
@@ -157,11 +160,11 @@ def _restore_index(stored: ModelVersion, added: list[PastLabel], recipe: Recipe)
 def _score_novelty(stored: ModelVersion, item: StoredDecision | None) -> Novelty | None:
     """Compute how novel the trace of a decision was, by its version's `NoveltyGate`.
 
-    The gate calls a trace novel by its distance from the traces of the training. The result has
-    four numbers (level, texture, distortion, gaps), of which for a novel trace at least one is
-    above 1, or NaN because a feature overflowed. Returns None without a decision, if the decision's
-    reason is not `Reason.NOVEL`, and if the gate cannot be restored, because it was switched off or
-    is of another release of dengine.
+    The gate calls a trace novel by its distance from the traces of the training, in four respects
+    (level, texture, distortion, gaps). The result has for each the squared distance divided by its
+    limit; for a novel trace at least one is above 1, or NaN because a feature overflowed. Returns
+    None without a decision, if the decision's reason is not `Reason.NOVEL`, and if the gate cannot
+    be restored, because it was switched off or is of another release of dengine.
     """
     if item is None or item.decision.reason is not Reason.NOVEL:
         return None
@@ -178,13 +181,14 @@ def _score_novelty(stored: ModelVersion, item: StoredDecision | None) -> Novelty
 def _restore_rule(stored: ModelVersion, policy: Policy) -> DecisionRule | None:
     """Return the decision rule of a policy with the state that a version stored.
 
-    A state fits the rule if its arrays have the names and shapes of the rule's; whether it was
-    stored under the same policy is not checked. Returns None if the version has no such state: it
-    stored another rule, none (it is another cell's, or a baseline), or the rule was stale (it had
-    missed an update). Also None if the rule is a user's class whose module is not imported yet,
-    since nothing is imported here. A rule that learns nothing needs no state. Raises SettingError
-    if an object of the user's class cannot be made; an error of its constructor other than
-    TypeError is raised as it is.
+    The state is what the rule had learned, stored as arrays. It fits if they have the names and
+    shapes of the rule's arrays; whether it was stored under the same policy is not checked. Returns
+    None if the version has no state that fits: it stored another rule or none (it is a version of
+    another robot cell, or a model that the user handed in), or its rule was stale (it had missed an
+    update). Also None if the rule is a user's class whose module is not imported yet, since nothing
+    is imported here. A rule that learns nothing needs no state. Raises SettingError if an object of
+    the user's class cannot be made; an error of its constructor other than TypeError is raised as
+    it is.
     """
     if policy.guarantee not in RULES and policy.guarantee.partition(":")[0] not in sys.modules:
         # Nothing is imported because a store names it; a running engine has imported it.
@@ -202,14 +206,15 @@ def _restore_thresholds(
 ) -> Thresholds | None:
     """Return the thresholds of a version's rule after it was updated with later labels.
 
-    They are (accept, reject): a part was accepted if lower >= the first, rejected if 1 - upper >=
-    the second; if both held, a `MemberRule` had it verified. Labels of quarantined traces, labels
-    of rejected parts that somebody inspected, and overdue checks do not update the rule. The rule
-    "local" with stops="some" learns nothing, so both thresholds are the policy's lower bound; but
-    if the version stored the state of another rule, the result is None. Of any other rule the
-    result is None if `_restore_rule` returns None, or if the rule is no `MemberRule`: only rules of
-    this class have thresholds. Raises what `_restore_rule` raises, and what a user's rule raises in
-    an update.
+    They are (accept, reject), for the bounds lower and upper of the success probability: a part was
+    accepted if lower >= the first, rejected if 1 - upper >= the second; if both held, a
+    `MemberRule` (a rule that learns) had it verified. Labels of quarantined traces (never used in
+    training), labels of rejected parts that somebody inspected, and checks that were not reported
+    in time do not update the rule. The rule of the guarantee "local" with stops="some" learns
+    nothing, so both thresholds are the policy's lower bound; but if the version stored the state of
+    another rule, the result is None. Of any other rule the result is None if `_restore_rule`
+    returns None, or if the rule is no `MemberRule`: only rules of this class have thresholds.
+    Raises what `_restore_rule` raises, and what a user's rule raises in an update.
     """
     has_state = bool(arrays_with_prefix(stored.state, "rule."))
     if (policy.guarantee, policy.stops) == ("local", "some") and not has_state:
@@ -226,12 +231,15 @@ def _restore_thresholds(
 def load_rule(store: SqlStore, policy: Policy) -> DecisionRule | None:
     """Return the present decision rule: the stored rule, updated with all outcomes since.
 
-    If a label was corrected or a check is overdue, the stored rule cannot be continued, and a fresh
-    one is updated with all outcomes (for all such cases see `RuleProgress.last_seq`). The updates
-    may begin or end a safe mode of the returned rule; a fresh rule starts in the safe mode in which
-    it began before (`EvidenceWindow.began_in`). Nothing is written to the store, except records
-    that wait in its outbox, and an event if the arrays of a version are damaged; then the version
-    before it is taken. The store's ledger is not checked.
+    The rule is stored with each model version. If a label was corrected or a check is overdue (not
+    reported in time), the stored rule cannot be continued, and a fresh one is updated with all
+    outcomes since the rule last started anew, for example at a change of the policy (for all such
+    cases see `RuleProgress.last_seq`). The updates may begin or end a safe mode of the returned
+    rule (after an alarm parts are checked until outcomes allow decisions again); a fresh rule
+    starts in the safe mode, if any, in which it started then (`EvidenceWindow.began_in`). Nothing
+    is written to the store, except records that wait to be written, and an event in its log if the
+    arrays of a version are damaged; then the version before it is taken. The checksums of the
+    store's rows are not checked.
 
     Parameters
     ----------
@@ -243,10 +251,11 @@ def load_rule(store: SqlStore, policy: Policy) -> DecisionRule | None:
     DecisionRule or None
         None if there is no version, or none whose arrays are kept and intact, and if a user's class
         of rule is not imported. Also None if the newest version has no arrays with the names and
-        shapes of the rule's: another robot cell of the product made it, it is a baseline, it was
-        made under a policy whose rule has other arrays, or the rule was stale (it had missed an
-        update). A rule that learns nothing, like that of "local" with stops="some", has no arrays:
-        another cell's version will do for it, and it is never stale.
+        shapes of the rule's: another robot cell that shares the versions made it, it is a model
+        that the user handed in, it was made under a policy whose rule has other arrays, or the rule
+        was stale (it had missed an update). A rule that learns nothing, like that of the guarantee
+        "local" with stops="some", has no arrays: another cell's version will do for it, and it is
+        never stale.
 
     Raises
     ------
@@ -276,10 +285,12 @@ def load_rule(store: SqlStore, policy: Policy) -> DecisionRule | None:
 def _update_rule(rule: DecisionRule, outcome: PastLabel | OutcomeRecord) -> None:
     """Update a rule, in place, with the outcome of one part.
 
-    First `observe` gets `outcome.silent`, the number of unreported accepted parts since the
-    previous label, and whether this part was novel. Then `update` gets the bounds, the label, the
-    action that the model alone would have taken, and the inclusion probability. A safe mode of the
-    rule may begin or end. What a user's rule raises is raised.
+    First `observe` gets `outcome.silent`, the number of accepted parts since the previous label of
+    which nothing was reported, and whether the trace of this part was novel (unlike all training
+    traces). Then `update` gets the bounds of the success probability, the label, the action that
+    the model alone would have taken, and the probability with which the outcome would be asked for.
+    A safe mode of the rule, in which parts are checked until outcomes allow decisions again, may
+    begin or end. What a user's rule raises is raised.
     """
     rule.observe(outcome.silent, outcome.novel)
     rule.update(

@@ -89,10 +89,11 @@ class Circumstances:
 def bound_of(decision: Decision, circumstances: Circumstances) -> Bound | None:
     """Return a decision's bounds with the thresholds that they had to reach.
 
-    The result also has the counts of labels, and says in words where the thresholds come from. A
-    threshold is None if it is unknown, or if nothing could reach it. `circumstances` are the
-    settings of the engine, and the thresholds of its rule, at the decision. Returns None if no
-    bound was computed: for every reason but CERTAIN, UNCERTAIN, AUDIT and SAFE_MODE.
+    They bound the success probability. The result also has the counts of good and bad labels
+    nearby, and says in words where the thresholds come from. A threshold is None if it is unknown,
+    or if nothing could reach it. `circumstances` are the settings of the engine, and the thresholds
+    of its rule, at the decision. Returns None if no bound was computed: for every reason of a
+    decision but CERTAIN, UNCERTAIN, AUDIT and SAFE_MODE.
     """
     if decision.reason not in BOUNDED:
         return None
@@ -112,12 +113,13 @@ def _find_thresholds(circumstances: Circumstances) -> tuple[float | None, float 
     """Return accept threshold (of lower), reject threshold (of upper), and their origin in words.
 
     `circumstances` are the settings of the engine, and the thresholds of its rule, at a decision. A
-    part was accepted if lower >= the first, rejected if upper <= the second. Under the guarantee
-    "local", outside safe mode (or in one whose reason is not kept), they are LB
-    (`Policy.lower_bound`) and 1 - LB; else those of the version's rule at that time. Both are None
-    if they are unknown: they are not kept, a user's rule decided, or a model that the user handed
-    in decided by its own method. Otherwise the first is None if nothing could be accepted, the
-    second if nothing could be rejected; both may be.
+    part was accepted if the lower bound of its success probability was >= the first, rejected if
+    the upper one was <= the second. Under the guarantee (the rule that decides) "local" they are LB
+    (`Policy.lower_bound`) and 1 - LB, unless the decision was made in a safe mode (after an alarm)
+    whose reason is kept; else those of the model version's rule at that time. Both are None if they
+    are unknown: they are not kept, a user's rule decided, or a model that the user handed in
+    decided by its own method. Otherwise the first is None if nothing could be accepted, the second
+    if nothing could be rejected; both may be.
     """
     policy = circumstances.recipe.policy
     if circumstances.baseline or policy.guarantee not in RULES:
@@ -140,11 +142,12 @@ def explain_in_words(
 ) -> Iterator[str]:
     """Yield the sentences that explain a decision: its reason, its bounds, its outcome.
 
-    `circumstances` are the settings and the state of the engine at the decision. If `bound` is
-    None, the sentences on bounds are left out. The last sentence is on the label as corrected
-    by now; without a label, or if it was forgotten, it says that nothing was reported. `item` must
-    have its trace. Raises SettingError for a part outside the force limits if one of these limits
-    does not fit the trace.
+    `circumstances` are the settings and the state of the engine at the decision. If `bound`, which
+    `bound_of` returns, is None, the sentences on the bounds of the success probability are left
+    out. The last sentence is on the label (good or bad) as corrected by now; without a label, or if
+    a person withdrew it, it says that nothing was reported. `item` must have its trace. Raises
+    SettingError for a part outside the force limits (an operator's limits of the signal) if one of
+    these limits does not fit the trace.
     """
     decision = item.decision
     reason = _explain_reason(decision, item.trace, circumstances)
@@ -160,9 +163,11 @@ def explain_in_words(
 def _explain_reason(decision: Decision, trace: TraceArray, circumstances: Circumstances) -> str:
     """Return the reason of a decision, as text that follows "Accepted", "Rejected" or "Verified".
 
-    Verified is a part that was sent to the check. The text says so if the force limit that the
-    trace leaves, or the alarm that began the safe mode, is not known. Raises SettingError for a
-    part outside the force limits if one of these limits does not fit the trace.
+    Verified is a part that was sent to the check. If the reason is a force limit (an operator's
+    limit of the signal) or a safe mode (after an alarm parts are checked until outcomes allow
+    decisions again), the text names the limit that the trace leaves, or the alarm, or says that it
+    is not known. Raises SettingError for a part outside the force limits if one of these limits
+    does not fit the trace.
     """
     if decision.reason is Reason.OUTSIDE:
         left = " and ".join(_limits_left(trace, circumstances)) or "which is not known"
@@ -198,8 +203,9 @@ def _explain_reason(decision: Decision, trace: TraceArray, circumstances: Circum
 def _limits_left(trace: TraceArray, circumstances: Circumstances) -> Iterator[str]:
     """Yield, as text, each force limit of the policy in `circumstances` that a trace does not keep.
 
-    They are checked again, one by one; the trace may keep all of them. Raises SettingError for a
-    force limit that does not fit the trace.
+    A force limit is an operator's limit of the signal, and its text has the form
+    START:END:LOW:HIGH. The limits are checked again, one by one; if the trace keeps all of them,
+    nothing is yielded. Raises SettingError for a force limit that does not fit the trace.
     """
     x = torch.from_numpy(trace)
     for limits in circumstances.recipe.policy.force_limits:
@@ -217,7 +223,7 @@ def _bound_sentences(
     the sentences say so. For a model that the user handed in and that decides by its own method
     there is one sentence, with its counts and bounds. Under the guarantees (rules that decide)
     "pooled" and "cost" two equal bounds are given as one number, the mean of the success
-    probabilities that the heads of the reducer give, one in each embedding space. An interval is
+    probabilities that the reducer's classifiers give, one in each embedding space. An interval is
     rounded outward to three decimals.
     """
     n = decision.n_success + decision.n_failure

@@ -269,15 +269,18 @@ class Status:
     def alarm(self) -> str:
         """The most urgent thing that somebody should look at, in a sentence; "" if there is none.
 
-        The first of these that applies: a fault of the store, lost data, safe mode, too many bad
-        parts among the accepted, too many good parts among the rejected, the last 3 or more
-        retrains dropped, many traces that nearly repeat another (as the reason of the newest
-        accepted training says), in shadow mode too many bad parts among those that the model would
-        have accepted, mostly novel traces, mostly parts outside the force limits, any part for
-        which the model raised an exception. "Too many" means that the confidence interval of their
-        share lies above the tolerance: at the policy's alpha for accepted parts (`bad_accepts`), at
-        95 % for the others, where a rejected part of unknown outcome counts as bad. "Mostly" means
-        more than half. Parts are counted over the newest decisions alone.
+        The first of these that applies: a fault of the store, lost data, safe mode (after an alarm
+        parts are checked until outcomes allow decisions again), too many bad parts among the
+        accepted, too many good parts among the rejected, the last 3 or more retrains dropped (their
+        models were not put in force), many traces that nearly repeat another (as the reason of the
+        newest accepted training says), in shadow mode (every part is checked) too many bad parts
+        among those that the model would have accepted, mostly novel traces (unlike all training
+        traces), mostly parts outside the force limits (an operator's limits of the signal), any
+        part for which the model raised an exception. "Too many" means that the confidence interval
+        of their share lies above the tolerance, the share that the policy allows: at the policy's
+        alpha for accepted parts (`bad_accepts`), at 95 % for the others, where a rejected part of
+        unknown outcome counts as bad. "Mostly" means more than half. Parts are counted over the
+        newest decisions alone (`newest`).
         """
         newest = self.newest
         accepts = newest.bad_accepts
@@ -326,15 +329,16 @@ class Status:
 def retrain_fault(dropped: Sequence[str], version: int) -> str:
     """Return an alarm in words if the last 3 or more retrains were dropped, else "".
 
-    It has the reason of the last one, and says if there is no version yet, so that nothing is
-    decided without a check.
+    A retrain is dropped if its model is not put in force. The alarm has the reason of the last one,
+    and says if there is no version yet, so that nothing is decided without a check.
 
     Parameters
     ----------
     dropped : sequence of str
-        Reasons of the retrains that were dropped since the last accepted retrain, oldest first.
+        Reasons of the retrains that were dropped since the last one that was put in force, oldest
+        first.
     version : int
-        Number of the version in force; 0 before the first.
+        Number of the model version in force; 0 before the first.
 
     Returns
     -------
@@ -351,10 +355,12 @@ def retrain_fault(dropped: Sequence[str], version: int) -> str:
 def status(store: SqlStore, last: int = NEWEST, watching: bool = False) -> Status:
     """Read the status of an engine from its store.
 
-    A damaged label among those since the newest retrain is left out, and an event is written to the
-    store. The arrays of the newest version are read for `Status.watch`, and also if a rollback, a
-    release or a change of policy made this version. If they are damaged, an event is written, too,
-    and those of the version before it are taken.
+    A label since the newest retrain that is damaged (not as it was stored) is left out, and an
+    event is written to the store's log. The arrays of the newest model version are read for
+    `Status.watch`, and also if this version was not trained, but made by a rollback (an earlier
+    version was put in force again and pinned), by a release (the pinned version may be replaced
+    again) or by a change of policy. If they are damaged, an event is written, too, and those of the
+    version before it are taken.
 
     Parameters
     ----------
@@ -363,14 +369,15 @@ def status(store: SqlStore, last: int = NEWEST, watching: bool = False) -> Statu
         Number of newest decisions that `Status.newest` counts.
     watching : bool, default False
         Whether `Status.watch` is computed, too: how close each detector of drift is to an alarm.
-        Without detectors ("local" with stops="some") it is None, and no arrays are read for it.
+        Without detectors (guarantee "local" with stops="some") it is None, and no arrays are read
+        for it.
 
     Returns
     -------
     Status
-        Counts, settings, certificate, retrains, events and more; see its attributes. Its
-        `store_fault` is "", `retraining` False and `store_lag` 0.0: only a running engine knows
-        them.
+        Counts, settings, certificate (upper bounds on the shares of wrong decisions), retrains,
+        newest events and more; see its attributes. Its `store_fault` is "", `retraining` False and
+        `store_lag` 0.0: only a running engine knows them.
 
     Raises
     ------
@@ -379,8 +386,8 @@ def status(store: SqlStore, last: int = NEWEST, watching: bool = False) -> Statu
         or another stored value that cannot be read, and if the database fails.
     SettingError
         For a stored recipe that cannot be read; with `watching` also if an object of the user's
-        class of rule cannot be made. An error of the rule's constructor other than TypeError, and
-        any error of its `observe` or `update`, is raised as it is.
+        class of decision rule cannot be made. An error of the rule's constructor other than
+        TypeError, and any error of its `observe` or `update`, is raised as it is.
     ValueError
         For a stored setting that must be a number and is none.
     """
@@ -434,9 +441,11 @@ def status(store: SqlStore, last: int = NEWEST, watching: bool = False) -> Statu
 def _read_pinned(store: SqlStore, accepted: list[RetrainReport]) -> int:
     """Return the number of the earlier version that a rollback put in force again, else 0.
 
-    `accepted` holds the reports of all versions that were put in force, oldest first. If the newest
-    of them was trained, nothing is pinned, and no arrays are read. If the arrays of the newest
-    version are damaged, an event is written to the store, and those of the version before count.
+    Such a version is pinned: no automatic retrain replaces it until it is released. Its number
+    stands among the arrays of the newest version. `accepted` holds the reports of all versions that
+    were put in force, oldest first. If the newest of them was trained, nothing is pinned, and no
+    arrays are read. If the arrays of the newest version are damaged (not as they were stored), an
+    event is written to the store's log, and those of the version before count.
     """
     if not accepted or accepted[-1].reason.startswith(TRAINED):  # spares reading its arrays
         return 0
@@ -451,10 +460,12 @@ def _count_span(tally: Tally, retrains: list[StoredVersion], policy: Policy) -> 
     """Return the counts over a tally's decisions, and over the retrains since the first decision.
 
     Without decisions no retrain counts. A `Tally` holds how many decisions have each combination of
-    properties, like action and reason; `retrains` are all retrains of the robot cell. The intervals
-    of `would_accept` and `would_reject` (how often the model would have been wrong) are at 95 %,
-    whatever the policy's alpha. Their basis is "audits", or "checks" if the policy of now has no
-    audit rate, or "" if no outcome is known.
+    properties, like action and reason; `retrains` are all retrains of the robot cell.
+    `would_accept` and `would_reject` estimate how often the model would have been wrong, from parts
+    about which it was certain, but which were checked all the same (audits). Their intervals are at
+    95 %, whatever the policy's alpha. Their `basis` is "audits", or "checks" if the present policy
+    has no audit rate (as in shadow mode, in which every part is checked), or "" if no outcome is
+    known.
     """
     outcomes = tally.outcomes
     first = tally.first
@@ -506,13 +517,14 @@ def _estimate_error(
     n: int | None = None,
     basis: str = "audits",
 ) -> ErrorEstimate:
-    """Return the estimate of the share of wrong decisions, of which `n_wrong` are among `n_known`.
+    """Estimate the share of wrong decisions from `n_wrong` wrong ones among `n_known` ones.
 
     `n_known` is the number of parts whose outcomes are known, and `n` that of all parts, by default
-    `n_known`. The bounds are the two-sided Wilson interval at error level `alpha`, and the verdict
-    says whether it is below `tolerance` ("kept"), above ("broken"), or neither ("open"). `basis`
-    says in a word where the outcomes come from. If `n_known` is 0, the bounds are 0 and 1, and the
-    basis is "", and the verdict is "open" for any tolerance below 1.
+    `n_known`; `n` is only passed on. The bounds are the two-sided Wilson interval at error level
+    `alpha`, and the verdict says whether this interval is below `tolerance`, the share that is
+    allowed ("kept"), above ("broken"), or neither ("open"). `basis` says in a word where the
+    outcomes come from. If `n_known` is 0, the bounds are 0 and 1, and the basis is "", and the
+    verdict is "open" for any tolerance below 1.
     """
     low, high = wilson_interval(n_known - n_wrong, n_wrong, alpha)
     lower = 1.0 - high
@@ -542,14 +554,15 @@ def _verdict(lower: float, upper: float, tolerance: float) -> str:
 def bad_accepts(outcomes: Outcomes, policy: Policy) -> ErrorEstimate:
     """Estimate the share of bad parts among those that the model would have accepted.
 
-    These are the accepted parts, and the audited parts that have a label and would have been
-    accepted; `n` counts both. A forgotten label does not count. If the outcomes of all accepted
-    parts are known, the estimate rests on these outcomes. Under `stops="all"` (every bad part stops
-    the line) one known outcome is enough; accepted parts without a report are then left out.
-    Otherwise the estimate rests on the audits, because the audit draw does not depend on the
-    outcome. Line stops, the accepted parts that are known to be bad, then move the interval: its
-    lower end is at least the one that follows if all other accepted parts were good, and its upper
-    end at least the share of line stops among the accepted parts.
+    These are the accepted parts, and the audited parts (drawn at random and checked, although the
+    model was certain) that have a label and would have been accepted; `n` counts both. A label that
+    a person withdrew does not count. If the outcomes of all accepted parts are known, the estimate
+    rests on these outcomes. Under `stops="all"` (every bad accepted part stops the line and is
+    reported) one known outcome is enough; accepted parts without a report are then left out.
+    Otherwise the estimate rests on the audits, because their draw does not depend on the outcome.
+    Line stops, the accepted parts that are known to be bad, then move the interval: its lower end
+    is at least the one that follows if all other accepted parts were good, and its upper end at
+    least the share of line stops among the accepted parts.
 
     Parameters
     ----------
@@ -560,8 +573,9 @@ def bad_accepts(outcomes: Outcomes, policy: Policy) -> ErrorEstimate:
     Returns
     -------
     ErrorEstimate
-        At the policy's alpha. If no part was accepted, like in shadow mode, its `n` is 0, even if
-        parts were audited; see `Span.would_accept` then.
+        Share, interval at the policy's alpha, and verdict. If no part was accepted, like in shadow
+        mode (every part is checked), its `n` is 0, even if parts were audited; see
+        `Span.would_accept` then.
     """
     tolerance = policy.tolerances[0]
     if not outcomes.accepted:
@@ -584,10 +598,12 @@ def bad_accepts(outcomes: Outcomes, policy: Policy) -> ErrorEstimate:
 def read_watch(store: SqlStore, recipe: Recipe, mode: Event | None) -> Watch | None:
     """Return how close the drift detectors are to an alarm, and a safe mode to its end.
 
-    They are read from the rule that `load_rule` returns. None if that is None, and if the rule has
-    no drift detectors: "local" with stops="some", and a user's rule that is no `MemberRule`. The
-    values `accepts`, `rejects` and `novelty` grow from 0 to 1, the alarm. In a safe mode that novel
-    traces began, all three are 0.
+    A drift detector is a running test for more wrong decisions than allowed (`accepts`, `rejects`),
+    or for many novel traces (`novelty`). Its alarm begins a safe mode, in which parts are checked
+    until new outcomes allow decisions again. Both are read from the present decision rule, which
+    `load_rule` returns. None if it returns None, and if the rule has no drift detectors: that of
+    the guarantee "local" with stops="some", and a user's rule that is no `MemberRule`. The three
+    values grow from 0 to 1, the alarm. In a safe mode that novel traces began, all three are 0.
 
     The text `recovery` says how many parts since the alarm (10,001 are counted at most) count as
     evidence, for how many of these accepting (rejecting, after an alarm about rejected parts) would
@@ -665,7 +681,9 @@ def read_course(store: SqlStore, **by: float) -> Course:
     Returns
     -------
     Course
-        It has all retrains of this cell, also those before the first stretch.
+        For each stretch, oldest first, how many decisions it has, and how many of these were
+        verified, accepted, rejected and so on; and all retrains of this cell, also those before the
+        first stretch.
     """
     n = max(1, min(MAX_STRETCHES, store.decisions.newest_number() // MIN_STRETCH))
     return Course(
@@ -684,8 +702,9 @@ def history(store: SqlStore, last: int | None = None, **where: Any) -> Iterator[
         Number of newest decisions of the selection; all of these are read by this call. None: all
         decisions of the selection, which are read in pages during the iteration.
     **where
-        The selection: action, reason, label, since, until, predicted or part, the fields of
-        `HistoryFilter`.
+        The selection: action, reason, label, since, until, predicted (the action that the model
+        alone would have taken) or part, the fields of `HistoryFilter`. A decision must fit all that
+        are given.
 
     Returns
     -------
@@ -732,8 +751,8 @@ def iterate_decisions(
     page_size : int, default 500
         Decisions read at a time.
     start_after : str or None
-        Id of a decision: the iteration starts with the next decision in its direction. For an id
-        that the robot cell does not have nothing is yielded. None: it starts with the newest or
+        Id of a decision: the iteration starts with the next decision in its direction. If the robot
+        cell has no decision of this id, nothing is yielded. None: it starts with the newest or
         oldest.
     newest_first : bool, default True
         False: oldest first. Decisions that are made during the iteration are then yielded, too.
@@ -767,7 +786,7 @@ def as_frame(decisions: Iterable[StoredDecision]) -> pd.DataFrame:
     pandas.DataFrame
         A row for each decision, indexed by its id; without decisions it has these columns and no
         row. The columns are the other fields of `Decision` without the embedding, `time` in UTC,
-        and `label`, which is "good", "bad" or None, if there is none or it was forgotten; a
+        and `label`, which is "good", "bad" or None, if there is none or a person withdrew it; a
         corrected label is shown as corrected. Actions and reasons are texts.
     """
     import pandas as pd

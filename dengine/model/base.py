@@ -186,10 +186,11 @@ class EngineModel(ABC):
     def decider(self, conditions: DecisionConditions | None) -> Decider:
         """Return the module that decides under these conditions, and keep it for the next call.
 
-        The conditions are the force limits, the range of the sensor and the audits. The decider is
-        built anew if none is kept, or if the kept one is for other conditions; this raises what
-        `build_decider` raises. None, which only a `ModelPrediction` (dengine's own model) takes,
-        stands for no force limits, a sensor without a known range, and no audits.
+        The conditions are the force limits (an operator's limits of the signal), the range of the
+        sensor and the audits (random checks of parts about which the model is certain). The module
+        is built anew if none is kept, or if the kept module is for other conditions; this raises
+        what `build_decider` raises. None, which only a `ModelPrediction` (dengine's own model)
+        takes, stands for no force limits, a sensor without a known range, and no audits.
         """
         is_same = conditions is self._conditions or conditions == self._conditions
         if self._decider is None or not is_same:
@@ -438,17 +439,18 @@ class BaselinePredictor(nn.Module):
         self.model = model
 
     def forward(self, x: Tensor, part: int = 0) -> Predicted:
-        """Predict one trace (C, T) by the baseline.
+        """Predict one trace (C, T) by the baseline, a model that the user handed in.
 
         Returns the positions of action and reason in `ACTIONS` and `REASONS`, the bounds of the
-        success probability, the label counts n_success and n_failure, and an embedding that is
-        always empty, shape (0, 0). The baseline gets the samples of `x` without a copy, so what it
-        writes to them changes `x`. The reason is UNCERTAIN for VERIFY, otherwise CERTAIN. `part`
-        has no effect, because a baseline knows nothing of parts. Raises ValueError for an unknown
-        action, for other than one value of each bound or count, and for counts that are not whole
-        numbers from 0 to 2**63 - 1 (OverflowError for an infinite count). Of several actions the
-        first counts; without one IndexError is raised. Errors of the baseline are raised as they
-        are, and bounds are not checked.
+        success probability, the numbers of good and bad labels behind the prediction (n_success,
+        n_failure), and an embedding that is always empty, shape (0, 0). The baseline gets the
+        samples of `x` without a copy, so what it writes to them changes `x`. The reason is
+        UNCERTAIN for VERIFY (the part must be checked), otherwise CERTAIN. `part` has no effect,
+        because a baseline knows nothing of parts. Raises ValueError for an unknown action, for
+        other than one value of each bound or count, and for counts that are not whole numbers from
+        0 to 2**63 - 1 (OverflowError for an infinite count). Of several actions the first counts;
+        without one IndexError is raised. Errors of the baseline are raised as they are, and bounds
+        are not checked.
         """
         X = x.numpy()[None]
         (lower,), (upper,) = self.model.predict_interval(X)

@@ -130,15 +130,17 @@ class Predictor(nn.Module):
     def forward(self, x: Tensor, part: int = 0) -> Predicted:
         """Predict one trace (C, T) of float32.
 
-        `part` is the hash of the part that the trace is of; references of this part are not
-        counted, and 0 excludes none. Returns the positions of action and reason in `ACTIONS` and
-        `REASONS`, the bounds lower and upper of the success probability, the counts n_success and
-        n_failure of the labels within the radius, and the embedding (K, d), divided by the scale of
-        each embedding space. Several labels of one part may count as fewer. If the rule only sorts
-        parts and the reducer gives a probability of success (`RadiusNeighbours.scored`), both
-        bounds are the mean of this probability over the K spaces; for a rule with `prior_labels` it
-        is drawn towards 1/2 while few references are known. A novel trace is verified without
-        counting: its bounds are 0 and 1, its counts are 0.
+        `part` is the hash of the part that the trace is of; references (labelled points) of this
+        part are not counted, and 0 excludes none. Returns the positions of action and reason in
+        `ACTIONS` and `REASONS`, the bounds lower and upper of the success probability, the counts
+        n_success and n_failure of the labels within the radius, and the embedding (K, d), a point
+        in each of K spaces, divided by the scale (unit of length) of the space. Several labels of
+        one part may count as fewer. If the decision rule uses the bounds only to sort parts, and
+        the reducer gives a probability of success (`RadiusNeighbours.scored`), both bounds are the
+        mean of this probability over the K spaces; for a rule with `prior_labels` it is drawn
+        towards 1/2 while few references are known. A novel trace, unlike all training traces, is
+        verified (sent to the slow check) without counting: its bounds are 0 and 1, its counts are
+        0.
         """
         z = self.embed(x)
         if self.novelty(x):
@@ -169,13 +171,13 @@ _COMPILED: dict[Any, Any] = {}
 def template_of(eager: Decider, warm_up_shape: tuple[int, ...]) -> Any:
     """Return the template of a decider: a compiled decider of the same structure (`structure_of`).
 
-    If the process keeps none of this structure, `eager`, a decider in Python, is compiled, which
-    takes tens of milliseconds. The new template then decides three times on a trace of shape
-    `warm_up_shape` (C, T) whose samples rise from 0 to 1, so that later calls are fast. The process
-    keeps it, and drops the oldest if there were 16 (`KINDS`) before. All deciders of a structure
-    have the same template, which shares the tensors of the decider that was compiled, so do not
-    change it: `compiled` copies it. Raises what `script` raises if TorchScript cannot compile the
-    decider, and torch.jit.Error if it cannot run.
+    A decider is the module that decides on one trace. If the process keeps no template of this
+    structure, `eager`, a decider in Python, is compiled, which takes tens of milliseconds. The new
+    template then decides three times on a trace of shape `warm_up_shape` (C, T) whose samples rise
+    from 0 to 1, so that later calls are fast. The process keeps it, and drops the oldest if there
+    were 16 (`KINDS`) before. All deciders of a structure have the same template, which shares the
+    tensors of the decider that was compiled, so do not change it: `compiled` copies it. Raises what
+    `script` raises if TorchScript cannot compile the decider, and torch.jit.Error if it cannot run.
     """
     structure = structure_of(eager)
     if (template := _COMPILED.get(structure)) is None:
@@ -196,8 +198,9 @@ def structure_of(eager: nn.Module) -> tuple[Any, ...]:
     The key holds the class and the attributes of all submodules of `eager`, a module in Python; of
     a tensor it holds only the shape, because `compiled` sets the values. Objects that are no
     constant, tensor, function, list, tuple or dict make no difference. The module of the force
-    limits is left out, so that their number makes no difference. The class itself is in the key,
-    not its name: a notebook cell that is run again defines another class.
+    limits (an operator's limits of the signal) is left out, so that their number makes no
+    difference. The class itself is in the key, not its name: a notebook cell that is run again
+    defines another class.
     """
     return tuple(
         (path, type(module), _as_key(attributes_of(module)))
@@ -235,9 +238,11 @@ def _as_key(value: object) -> object:
 def compiled(eager: Decider, warm_up_shape: tuple[int, ...]) -> Any:
     """Return a compiled decider that shares the tensors of an eager one.
 
-    It is a copy of the template that the process keeps for all deciders of this structure. If the
-    process has no such template, `template_of` compiles it, and calls it on a trace of
-    `warm_up_shape` (C, T). Raises what `template_of` raises.
+    A decider is the module that decides on one trace; `eager` is one in Python. The result is a
+    copy of the template, a compiled decider that the process keeps for all deciders with the same
+    classes, attributes and shapes of tensors (`structure_of`). If the process has no such template,
+    `template_of` compiles it, and calls it on a trace of `warm_up_shape` (C, T). Raises what
+    `template_of` raises.
     """
     module = copy.deepcopy(template_of(eager, warm_up_shape))
     submodules = dict(module.named_modules(remove_duplicate=False))
@@ -249,23 +254,25 @@ def compiled(eager: Decider, warm_up_shape: tuple[int, ...]) -> Any:
 
 
 def compare_points(decider: Decider, X: Floats, points: Floats) -> str:
-    """Compare the embeddings of a decider with the points of a reducer.
+    """Compare the embeddings of a decider, which decides on one trace, with a reducer's points.
 
     Raises what the decider raises, and ValueError if there are not as many points as traces.
 
     Parameters
     ----------
     decider : Decider
-        Compiled or not. It decides on each trace as on a trace of an unknown part.
+        Compiled or not. It is asked about each trace alone, without the number of a part.
     X : array of float32, shape (n, C, T)
     points : array of float32, shape (n, K, d)
-        The scaled embeddings that the reducer gives, one in each of its K spaces.
+        The embeddings that the reducer gives, one in each of its K spaces, each divided by the
+        scale (unit of length) of the space.
 
     Returns
     -------
     str
         A sentence on what is wrong; "" if the two agree on each trace in which the decider finds no
-        fault: no coordinate is NaN, and each may differ by 0.001 times (1 + its absolute value).
+        fault, such as a NaN: no coordinate is NaN, and each may differ by 0.001 times (1 + its
+        absolute value).
     """
     for x, expected in zip(X, points, strict=True):
         with torch.inference_mode():
@@ -345,14 +352,14 @@ class ModelPrediction(EngineModel):
 
     @classmethod
     def from_recipe(cls, recipe: Recipe, seed: int = 0) -> Self:
-        """Return the untrained model that a `Recipe` describes.
+        """Return the untrained model that a `Recipe`, the settings of an engine, describes.
 
         `seed` is the `random_state` of a reducer that the recipe names, if its class takes that and
         `params` do not set it; it has no effect on a reducer that is an object. Reducer, radius,
-        folds, novelty, policy and decision rule are the recipe's; `recipe.window` is the largest
-        number of references. A user's class, of the reducer or the rule, is imported. Raises
-        SettingError if the reducer or the rule cannot be made; other errors of the constructor of a
-        user's class are raised as they are.
+        number of folds, novelty limit, policy and decision rule are the recipe's; `recipe.window`
+        is the largest number of references (labelled points). A user's class, of the reducer or the
+        rule, is imported. Raises SettingError if the reducer or the rule cannot be made; other
+        errors of the constructor of a user's class are raised as they are.
         """
         policy = recipe.policy
         return cls(
@@ -395,10 +402,12 @@ class ModelPrediction(EngineModel):
     def fit(self, X: ArrayLike, y: ArrayLike, *, hashes: Ints | None = None) -> Self:
         """Train the reducer from scratch, and make the traces the references in place of the old.
 
-        If there are more traces than the classifier's capacity, only the last become references.
-        Extreme samples, also infinite ones, are clipped first (`clip_extremes`). The scales of the
-        embedding spaces and the novelty gate are computed anew as well, the decision rule stays as
-        it is. If the training raises, the reducer is left untrained: call `fit` again.
+        References are the labelled points with which a new trace is compared. If there are more
+        traces than the classifier's `capacity`, only the last become references. Extreme samples,
+        also infinite ones, are clipped first (`clip_extremes`). The scale (unit of length) of each
+        embedding space and the novelty gate (which notices traces unlike these) are computed anew
+        as well; the decision rule stays as it is. If the training raises, the reducer is left
+        untrained: call `fit` again.
 
         Parameters
         ----------
@@ -406,7 +415,8 @@ class ModelPrediction(EngineModel):
         y : array of int, shape (n,)
             1 is success, 0 is failure.
         hashes : array of int64, shape (n,), optional
-            `folds.trace_hash` of each trace, which gives its fold. None: `folds.content_hash`.
+            `folds.trace_hash` of each trace, which stands for its part and gives its fold (the
+            group for cross-fitting). None: `folds.content_hash`.
 
         Returns
         -------
@@ -441,18 +451,22 @@ class ModelPrediction(EngineModel):
     ) -> Self:
         """Train the reducer on traces (n, C, T), and replace the references by them; return self.
 
-        A reducer that can go on from its last training does so. If there are more traces than the
-        classifier's capacity, only the last become references. `index`, `scale` (the divisor of the
-        points in each embedding space), `gate` (the novelty gate, disabled if `novelty` is 0, or
-        for too few traces, see `fit_novelty`), `examples` (up to 8 of the traces), the
-        `repeats_note` of `report` and `trace_shape` are replaced, the decider is dropped and built
-        anew when it is used, and the decision rule stays as it is. y (n,) are labels, 1 or 0;
-        `hashes` (n,), of the parts, give the folds; `numbers` (n,), of the labels, are kept with
-        the references, and by them the reducer finds what `precompute` kept; `stop` may end the
-        reducer's training early. Extreme samples are clipped first. Raises what the reducer's
-        `train` raises, such as SettingError if it cannot be trained on these traces, and
-        SettingError if 20 traces or more are all of one part. If the reducer raises, it may be
-        changed already; all else is not.
+        References are the labelled points with which a new trace is compared. y (n,) are labels, 1
+        good or 0 bad; `hashes` (n,) stand for the parts, and give the folds for cross-fitting;
+        `numbers` (n,), the labels' sequence numbers, are kept with the references, and by them the
+        reducer finds what `precompute` kept; `stop` may end the reducer's training early. Extreme
+        samples are clipped first. A reducer that can go on from its last training does so. If there
+        are more traces than the classifier's `capacity`, only the last become references.
+
+        Replaced are `index` (the references), `scale` (the divisor of the points in each embedding
+        space), `gate` (the novelty gate, which notices traces unlike these; disabled if `novelty`
+        is 0, or for too few traces, see `fit_novelty`), `examples` (up to 8 of the traces),
+        `trace_shape`, and in `report` the note on parts that seem to have come twice. The module
+        that decides is dropped and built anew when it is used; the decision rule stays as it is.
+
+        Raises what the reducer's `train` raises, such as SettingError if it cannot be trained on
+        these traces, and SettingError if 20 traces or more are all of one part. If the reducer
+        raises, it may be changed already; all else is not.
         """
         X = clip_extremes(X)
         y = y.astype(np.int64)
@@ -488,13 +502,13 @@ class ModelPrediction(EngineModel):
     def precompute(self, X: Floats, numbers: Ints | None = None) -> None:
         """Let the reducer compute in advance what a training on these traces (n, C, T) begins with.
 
-        `numbers` are the labels' sequence numbers, by which the reducer finds its results again;
-        without them a reducer of dengine keeps none. Samples far larger than usual are clipped
-        first (`clip_extremes`). Before the first training, if the reducer gives an
+        `numbers` are the sequence numbers of the traces' labels, by which the reducer finds its
+        results again; without them a reducer of dengine keeps none. Samples far larger than usual
+        are clipped first (`clip_extremes`). Before the first training, if the reducer gives an
         `untrained_module` and the decision rule is `scriptable`, a decider (the module that decides
-        on a trace) without references is compiled as well, because the first training has no time
-        for that; the process keeps it as a template (`template_of`). Raises what `template_of` and
-        the reducer raise.
+        on a trace) without references (labelled points) is compiled as well, because the first
+        training has no time for that; the process keeps it as a template (`template_of`). Raises
+        what `template_of` and the reducer raise.
         """
         X = clip_extremes(X)
         encoder = self.spaces.untrained_module(X)
@@ -512,7 +526,8 @@ class ModelPrediction(EngineModel):
         """Take over the decision rule object of the previous model, and build the decider.
 
         If the rule of either model is stale, because an update of it failed, this model is stale
-        afterwards. The decider is built for the `DecisionConditions` under which the previous model
+        afterwards. The decider, the module that decides on one trace, is built for the
+        `DecisionConditions` (force limits, sensor range and audits) under which the previous model
         decided, or, if that never decided, for those of this model, if it has any. A decider that
         this model has already, with the same rule and for the same conditions, is kept. Nothing
         happens if the previous model is no `ModelPrediction`. Raises what `build_decider` raises;
@@ -530,14 +545,17 @@ class ModelPrediction(EngineModel):
             self._conditions = conditions
 
     def build_decider(self, conditions: DecisionConditions | None) -> Decider:
-        """Build a decider, which shares the references and the decision rule of this model.
+        """Build a decider, the module that decides on a trace, for this model.
 
-        It is returned, not kept; `decider` keeps one.
+        It shares the references (labelled points) and the decision rule of this model. It is
+        returned, not kept; `decider` keeps one.
 
         Parameters
         ----------
         conditions : DecisionConditions or None
-            None stands for no force limits, a sensor without a known range, and no audits.
+            Force limits (an operator's limits of the signal), range of the sensor, and audits
+            (random checks of parts about which the model is certain). None stands for no force
+            limits, a sensor without a known range, and no audits.
 
         Returns
         -------
@@ -567,12 +585,13 @@ class ModelPrediction(EngineModel):
         return decider
 
     def _eager_decider(self, encoder: Any, conditions: DecisionConditions | None) -> Decider:
-        """Return a decider that is not compiled, in evaluation mode, for `build_decider`.
+        """Return the module that decides on a trace, not compiled, in evaluation mode.
 
-        `encoder` is the module that embeds, (B, C, T) -> (B, K, d), compiled or not. The decider
-        shares references, rule and novelty gate with this model. `conditions` are as in
-        `build_decider`. Raises SettingError if the force limits do not fit the traces, and
-        AttributeError if nothing was fitted.
+        `encoder` is the module that embeds, (B, C, T) -> (B, K, d), compiled or not. The result
+        shares references (labelled points), decision rule and novelty gate (which notices traces
+        unlike those of the training) with this model. `conditions` are force limits, sensor range
+        and audits, as in `build_decider`. Raises SettingError if the force limits do not fit the
+        traces, and AttributeError if nothing was fitted.
         """
         predictor = Predictor(
             encoder,
@@ -587,7 +606,8 @@ class ModelPrediction(EngineModel):
     def trace_spec(self) -> TraceSpec:
         """`TraceSpec` with the shape of the training traces, all else as by default.
 
-        Raises ValueError if nothing was fitted.
+        A `TraceSpec` says what traces look like: shape, sampling rate, units. Raises ValueError if
+        nothing was fitted.
         """
         if "index" not in vars(self):
             raise ValueError("Expected a fitted model; call fit(X, y) first.")
@@ -629,13 +649,15 @@ class ModelPrediction(EngineModel):
     ) -> Floats:
         """Make one labelled trace (channels, samples) a reference in the space of its fold.
 
-        The hash of its part, `hash_`, gives the fold, which is also the number of the embedding
-        space. The reference is `point` if given, otherwise the row of `embedding` for that space,
-        both divided by the scale already; without both it is computed from the trace. A full index
-        drops its oldest reference. `y` is 1 for success, 0 for failure; `number` is the sequence
-        number of this label. Returns the reference point, float32 (d,), divided by the scale of the
-        space. If it must be computed, the reducer's encoder gets the trace unchecked and may raise
-        errors of its own, and a decider is built and kept if none is, which raises what
+        A reference is a labelled point with which a new trace is compared. The hash of its part,
+        `hash_`, gives the fold, one of K permanent groups, which is also the number of the
+        embedding space. The reference point is `point` if given, otherwise the row of `embedding`
+        (K, d) for that space, both divided by the scale (unit of length) of the space already;
+        without both it is computed from the trace. If there is no room, the oldest reference is
+        dropped. `y` is 1 for success, 0 for failure; `number` is the sequence number of this label.
+        Returns the reference point, float32 (d,), divided by the scale. If it must be computed, the
+        reducer's encoder gets the trace unchecked and may raise errors of its own, and a decider
+        (the module that decides on a trace) is built and kept if none is, which raises what
         `build_decider` raises (ValueError or AttributeError if nothing was fitted). Otherwise
         raises AttributeError if nothing was fitted.
         """
@@ -673,11 +695,12 @@ class ModelPrediction(EngineModel):
         """Update the decision rule, in place, with the outcome of one part.
 
         The rule's `observe` gets `n_unreported`, the number of accepted parts without a known
-        outcome since the last update, and `novel`, whether its trace was novel; then its `update`
-        gets the bound by which the part was decided (`lower`, `upper`), the label `success`, what
-        the model alone would have done (`predicted`, an `ActionCode`), and the probability, fixed
-        beforehand, that the outcome would be asked for. The decider decides by the new state at
-        once. If one of the two raises, `rule_is_stale` is set and the exception is passed on.
+        outcome since the last update, and `novel`, whether the part's trace was unlike all training
+        traces; then its `update` gets the bound on the success probability by which the part was
+        decided (`lower`, `upper`), the label `success`, what the model alone would have done
+        (`predicted`: 0 verify, 1 accept, 2 reject), and the probability, fixed beforehand, that the
+        outcome would be asked for. The next decision is by the new state. If `observe` or `update`
+        raises, `rule_is_stale` becomes True and the exception is passed on.
         """
         was_stale = self.rule_is_stale
         self.rule_is_stale = True
@@ -709,11 +732,12 @@ class ModelPrediction(EngineModel):
     def with_policy(self, policy: Policy) -> Self:
         """Return a model under another policy; it shares all that was trained.
 
-        Its decision rule is new, has learned nothing and is not stale; its decider is not built
-        yet. This model does not change. But the two share reducer and references: a reference that
-        is added, relabelled or removed in one is so in the other, and `train` of one trains the
-        reducer of both; train a `successor`. Raises what `Policy.rule` raises, such as SettingError
-        if the rule cannot be made.
+        A policy holds the settings of decisions, such as error level and lower bound. The decision
+        rule of the new model has learned nothing, and is not stale (no update of it failed); the
+        module that decides is not built yet. This model does not change. But the two share reducer
+        and references (labelled points): a reference that is added, relabelled or removed in one is
+        so in the other, and `train` of one trains the reducer of both; so train a `successor`
+        instead. Raises what `Policy.rule` raises, such as SettingError if the rule cannot be made.
         """
         model = copy.copy(self)
         model.classifier = clone(self.classifier).set_params(
@@ -732,12 +756,14 @@ class ModelPrediction(EngineModel):
     def predict_one(self, x: Floats, hash_: int = 0) -> Prediction:
         """Predict one trace (channels, samples) without fault checks, force limits and audits.
 
-        Returns action, bounds of the success probability, label counts, embedding (K, d) and
-        reason, as a `Prediction`. References of the part with the hash `hash_` are not counted; 0
-        excludes none. The trace is not checked, and what the reducer's encoder or the rule raises
-        is raised. A decider is built and kept if none is. Raises RuntimeError if the decision rule
-        is stale, because an update of it failed, and what `build_decider` raises (ValueError or
-        AttributeError if nothing was fitted).
+        Returns action, bounds of the success probability, numbers of good and bad labels nearby,
+        embedding (K, d), a point in each of K spaces, and reason, as a `Prediction`. Left out are
+        force limits (an operator's limits of the signal) and audits (random checks of parts about
+        which the model is certain). References (labelled points) of the part with the hash `hash_`
+        are not counted; 0 excludes none. The trace is not checked, and what the reducer's encoder
+        or the rule raises is raised. A decider (the module that decides) is built and kept if none
+        is. Raises RuntimeError if the decision rule is stale, because an update of it failed, and
+        what `build_decider` raises (ValueError or AttributeError if nothing was fitted).
         """
         with torch.inference_mode():
             predicted = self.predictor(torch.from_numpy(x), hash_)
@@ -751,22 +777,28 @@ class ModelPrediction(EngineModel):
     def decide_one(self, x: Floats, part_hash: int, conditions: DecisionConditions) -> Verdict:
         """Decide on one raw trace x (C, T), in the unit of the sensor, under these conditions.
 
-        The decider, the module that decides, is built first, and kept, unless the model keeps a
-        decider for these conditions. References of the part with the hash `part_hash` are not
-        counted. 0 stands for an unknown part: then references with the same content hash as the
-        trace are not counted.
+        The `conditions` are force limits (an operator's limits of the signal), sensor range and
+        audits (random checks of parts about which the model is certain). The decider, the module
+        that decides, is built first, and kept, unless the model keeps a decider for these
+        conditions. References (labelled points) of the part with the hash `part_hash` are not
+        counted. 0 stands for a part without a number: then references with the same content hash as
+        the trace are not counted.
 
         Returns
         -------
         Verdict
-            The tuple that `Decider.forward` returns. Its embedding (K, d) has a point in each of
-            the K embedding spaces, divided by the scale of the space.
+            The tuple that `Decider.forward` returns: fault and content hash of the trace, action,
+            action of the model alone, reason, bounds of the success probability (lower, upper),
+            numbers of good and bad labels nearby, embedding, and the probability with which the
+            part is checked. The embedding (K, d) has a point in each of the K embedding spaces,
+            divided by the scale (unit of length) of the space.
 
         Raises
         ------
         RuntimeError
             If the decision rule is stale, because an update of it failed, and the trace has no
-            fault, even if a force limit decides. A faulty trace gets VERIFY without the rule.
+            fault, even if a force limit decides. A faulty trace (NaN, constant, ...) gets VERIFY
+            without the rule.
         ValueError, ...
             What `build_decider`, the reducer's encoder or the rule raises.
         """
@@ -822,9 +854,10 @@ class ModelPrediction(EngineModel):
     def successor(self) -> "ModelPrediction":
         """Return a model to train next, with a copy of this one's reducer to start from.
 
-        The successor has no decider yet. It shares decision rule, references, scale (the divisor of
-        the points in each embedding space) and novelty gate with this model. Training replaces the
-        last three in the successor only, so this model goes on deciding.
+        Its module that decides is not built yet. It shares decision rule, references (labelled
+        points), scale (the divisor of the points in each embedding space) and novelty gate (which
+        notices traces unlike those of the training) with this model. Training replaces the last
+        three in the successor only, so this model goes on deciding.
         """
         model = copy.copy(self)
         model.spaces = copy.deepcopy(self.spaces)
@@ -833,16 +866,17 @@ class ModelPrediction(EngineModel):
         return model
 
     def defect(self) -> str:
-        """Return why an engine must not use this version; "" if its tests find no reason.
+        """Return why an engine must not use this trained model; "" if no test finds a reason.
 
-        The references must be finite, and the points to which the reducer maps `examples`, some
-        training traces, must not be NaN. A reducer that is restored from the state of this one must
-        map `examples` to the same points, twice in a row; each coordinate may differ by 1e-5 times
-        (1 + its absolute value). If this reducer gives no state, it is itself asked twice in place
-        of a restored reducer. The points, divided by the scale of their embedding space, are kept
-        for `check_answers`, unless a reference is not finite. If restoring raises a StoreError,
-        that is a defect; other errors are raised. Call it right after a training: a restored model
-        has no `examples`, and some reducers raise TraceError then.
+        The references (labelled points) must be finite, and the points to which the reducer maps
+        `examples`, some training traces, must not be NaN. A reducer that is restored from the state
+        of this one must map `examples` to the same points, twice in a row; each coordinate may
+        differ by 1e-5 times (1 + its absolute value). If this reducer gives no state, it is itself
+        asked twice in place of a restored reducer. The points, divided by the scale of their
+        embedding space, are kept for `check_answers`, unless a reference is not finite. If
+        restoring raises a StoreError, that is a defect; other errors are raised. Call this right
+        after a training: a restored model has no `examples`, and some reducers raise TraceError
+        then.
         """
         if not np.isfinite(self.index.column("points")).all():
             return "the embedding of a reference is not finite"
@@ -869,11 +903,13 @@ class ModelPrediction(EngineModel):
     def get_state(self) -> State:
         """Return the state as arrays by name, which `set_state` takes.
 
-        Trace shape, references and scale (the divisor of the points in each embedding space) are
-        always in it. The names of the arrays of the reducer, the decision rule and the novelty gate
-        begin with "reducer.", "rule." and "novelty.". A reducer without a state and a disabled gate
-        have no arrays. In place of a stale rule there is "rule_is_stale". Arrays of the scale and
-        the reducer may be views. Raises AttributeError before the first training.
+        Trace shape, references (labelled points) and scale (the divisor of the points in each
+        embedding space) are always in it. The names of the arrays of the reducer, the decision rule
+        and the novelty gate (which notices traces unlike those of the training) begin with
+        "reducer.", "rule." and "novelty.". A reducer without a state and a disabled gate have no
+        arrays. If the rule is stale (an update of it failed), there is "rule_is_stale" in place of
+        its arrays. Arrays of the scale and the reducer may be views. Raises AttributeError before
+        the first training.
         """
         state: State = {"trace_shape": np.array(self.trace_shape), "scale": self.scale}
         state |= self.index.get_state()
@@ -890,11 +926,13 @@ class ModelPrediction(EngineModel):
     def set_state(self, state: Arrays) -> Self:
         """Restore the state that `get_state` returned; returns self.
 
-        Trace shape, references, scale (the divisor of the points in each embedding space), decision
-        rule (in place) and novelty gate are restored, and the reducer if the state holds it. If it
-        does not (`needs_refit`), train this model on the same traces before this call. The decider
-        is dropped, and `examples` stay. An index with a smaller capacity keeps the newest
-        references. If the state has no arrays of a rule, because the rule was stale or has no
+        Trace shape, references (labelled points), scale (the divisor of the points in each
+        embedding space), decision rule (in place) and novelty gate (which notices traces unlike
+        those of the training) are restored, and the reducer if the state holds it. If it does not
+        (`needs_refit`), train this model on the same traces before this call. The module that
+        decides is dropped and built anew when it is used; `examples` stay. If the classifier's
+        `capacity` is smaller than the number of references, the newest are kept. If the state has
+        no arrays of a rule, because the rule was stale (an update of it had failed) or has no
         tensors, this model's rule stays as it is; `rule_is_stale` always stays as it is. Raises
         StoreError if the state holds no reducer although this fitted reducer gives a state, and for
         a rule or gate of other sizes. For the state of another reducer it raises StoreError,
@@ -931,15 +969,15 @@ class ModelPrediction(EngineModel):
 def near_repeats(traces: Floats, parts: NDArray[np.int64]) -> int:
     """Count the traces among the newest 500 that nearly repeat a trace of another part.
 
-    Labels are counted as independent trials, so the number of a part that is inserted again must be
-    given (`part=`). This function notices plain cases in which it was not; no decision depends on
-    it. A trace is compared with the traces of other parts only, by the distance between the means
-    of 50 to 99 stretches of samples (fewer if there are fewer samples), from which the mean over
-    all traces is subtracted, in units of the standard deviation of the channel. A trace counts if
-    the nearest of them is nearer than 0.12 times the distance to the eleventh nearest (`NEAR`,
-    `NEIGHBOURS`), and the eleventh nearest is farther than 1e-6. So a trace with 11 or more equally
-    near traces does not count. If there are only 1 to 10 traces of other parts, the eleventh counts
-    as infinitely far, so the trace counts.
+    Labels are counted as independent trials, so a part that comes again must be given the number by
+    which it is known (`part=`). This function notices plain cases in which it was not; no decision
+    depends on it. A trace is compared with the traces of other parts only, by the distance between
+    the means of 50 to 99 stretches of samples (fewer if there are fewer samples), from which the
+    mean over all traces is subtracted, in units of the standard deviation of the channel. A trace
+    counts if the nearest of the others is nearer than 0.12 times the distance to the eleventh
+    nearest (`NEAR`, `NEIGHBOURS`), and the eleventh nearest is farther than 1e-6. So a trace with
+    11 or more equally near traces does not count. If there are only 1 to 10 traces of other parts,
+    the eleventh counts as infinitely far, so the trace counts.
 
     Parameters
     ----------
@@ -978,10 +1016,11 @@ def near_repeats(traces: Floats, parts: NDArray[np.int64]) -> int:
 def repeats_note(traces: Floats, parts: NDArray[np.int64]) -> str:
     """Return a note for the report of a retrain if many traces nearly repeat another, else "".
 
-    The note advises to give the parts' numbers, because parts seem to have come twice without one.
-    It takes the arguments of `near_repeats`, which counts such traces among the newest 500: traces
-    (n, C, T), oldest first, and `parts`, the hash of the part of each, or the content hash if the
-    part is unknown. More than 25 traces (`MANY_REPEATS`) are many; fewer than 100 traces have none.
+    The note advises to give the parts' numbers, by which a part is known when it comes again,
+    because parts seem to have come twice without one. It takes the arguments of `near_repeats`,
+    which counts such traces among the newest 500: traces (n, C, T), oldest first, and `parts`, the
+    hash of the part of each, or the content hash if the part is unknown. More than 25 traces
+    (`MANY_REPEATS`) are many; fewer than 100 traces have none.
     """
     n_repeats = near_repeats(traces, parts)
     if n_repeats <= MANY_REPEATS:

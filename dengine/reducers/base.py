@@ -75,7 +75,7 @@ class StopRule:
     last_step: float | None = None
 
     def exhausted(self, step: int, min_steps: int = 0) -> bool:
-        """Return whether step number `step`, counted from 0, may not begin any more.
+        """Return whether step number `step` of a fit, counted from 0, may not begin any more.
 
         That is so once `max_steps` steps were taken, or once the deadline is reached and at least
         `min_steps` steps were taken. With a deadline, `late` becomes True if the deadline is the
@@ -166,9 +166,10 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
     def transform(self, X: ArrayLike) -> Floats:
         """Embed each trace as one point, the mean over all embedding spaces, for pictures.
 
-        Decisions use `embed`, which gives a point in each space. A subclass defines this method or
-        `embed`. Traces are embedded one by one, as in a cell, since in a batch the last bits of a
-        result depend on the other traces.
+        A reducer that trains with labels has several embedding spaces, one for each fold of the
+        labels. Decisions use `embed`, which gives a point in each space. A subclass defines this
+        method or `embed`. Traces are embedded one by one, as in a cell, since in a batch the last
+        bits of a result depend on the other traces.
 
         Parameters
         ----------
@@ -441,8 +442,9 @@ class RowCache:
         self._rows = rows
 
     def update(self, numbers: Ints | None, compute: Callable[[Any], Floats]) -> Floats:
-        """Return the rows of these labels, float32 (m, p), and keep them and no others.
+        """Return the rows of the labels `numbers`, float32 (m, p), and keep them and no others.
 
+        A row holds values computed from a label's trace, so that they need not be computed again.
         ``compute(index)`` returns the rows that the cache lacks; `index`, a mask (m,) or a slice of
         all, selects them, perhaps none. `numbers` (m,), at least one, strictly increase and are
         never -1, which is not checked. `numbers` and the result are kept without a copy: do not
@@ -477,12 +479,13 @@ def points_in_fold_space(Z: Floats, folds: Ints) -> Floats:
 def space_scale(points: Floats, folds: Ints, n_spaces: int) -> Floats:
     """Return the scale of each embedding space: the root mean square radius of its points.
 
-    The radius is the distance from their mean. Space k has the points of fold k. Outliers are left
-    out, since a single outlier could make the scale so large that all other scaled points nearly
-    coincide. A point is an outlier if its distance from the median point (the median of each
-    coordinate) is more than 50 times the median of these distances; such a distance is the largest
-    absolute difference of a coordinate. If there are several outliers, and they are more than 5 %
-    of the fold's points, none is left out.
+    The points of a space are divided by its scale, so that distances mean the same in all. The
+    radius is the distance from their mean. Space k has the points of fold k, one of K groups of
+    traces. Outliers are left out, since a single outlier could make the scale so large that all
+    other scaled points nearly coincide. A point is an outlier if its distance from the median point
+    (the median of each coordinate) is more than 50 times the median of these distances; such a
+    distance is the largest absolute difference of a coordinate. If there are several outliers, and
+    they are more than 5 % of the fold's points, none is left out.
 
     Parameters
     ----------
@@ -565,9 +568,10 @@ def binary_labels(y: Any, n: int, name: str) -> Ints:
 def folds_of(traces: Floats, n_folds: int, folds: Any = None) -> Ints:
     """Return the folds of traces (n, C, T), int64 (n,): those given, or by a hash of each trace.
 
-    Given folds are cast to int64, so decimals are cut off. Raises SettingError unless there is a
-    fold for each trace, and each is from 0 to n_folds - 1, and raises what NumPy raises for folds
-    that are no numbers. A fold may have no trace.
+    A fold is a group of traces for cross-fitting. Given folds are cast to int64, so decimals are
+    cut off. Raises SettingError unless there is a fold for each trace, and each is from 0 to
+    n_folds - 1, and raises what NumPy raises for folds that are no numbers. A fold may have no
+    trace.
     """
     if folds is None:
         return content_fold(traces, n_folds)
@@ -583,10 +587,11 @@ def folds_of(traces: Floats, n_folds: int, folds: Any = None) -> Ints:
 def check_classes(labels: Ints, masks: NDArray[np.bool_]) -> None:
     """Raise SettingError unless, for each fold, the labels (n,) outside it have both classes.
 
-    Row k of `masks`, bool (K, n), tells which labels are outside fold k. The message asks for more
-    labels, and names the first fold outside which a class is missing. If no label is outside this
-    fold, it says instead that all traces are the same, which puts them into one fold, and asks to
-    check the sensor and the unit of measurement.
+    A fold is one of K groups of traces for cross-fitting. Row k of `masks`, bool (K, n), tells
+    which labels are outside fold k. The message asks for more labels, and names the first fold
+    outside which a class is missing. If no label is outside this fold, it says instead that all
+    traces are the same, which puts them into one fold, and asks to check the sensor and the unit of
+    measurement.
     """
     for fold, outside in enumerate(masks):
         n_classes = len(np.unique(labels[outside]))
@@ -637,14 +642,15 @@ def uses_labels(transformer: Any) -> bool:
 
 
 def as_reducer(transformer: Any, folds: int) -> Reducer:
-    """Return a transformer as a `Reducer`.
+    """Return a scikit-learn transformer as a `Reducer`, which embeds traces.
 
     A `Reducer` that has several embedding spaces, or uses no labels, is returned as it is. Another
     transformer whose tag says that it needs labels (`uses_labels`) is wrapped in `CrossFitted`,
-    which fits `folds` clones. A transformer without that tag is wrapped in `LabelFree` and never
-    gets labels, so its single space has seen none. The wrapper holds the transformer itself and
-    fits clones of it. Nothing is fitted here. Raises AttributeError for a transformer without
-    scikit-learn's tags, which `BaseEstimator` has.
+    which fits `folds` clones, each without the labels of one fold of the traces, and so has a space
+    for each fold. A transformer without that tag is wrapped in `LabelFree` and never gets labels,
+    so it has a single space. The wrapper holds the transformer itself and fits clones of it.
+    Nothing is fitted here. Raises AttributeError for a transformer without scikit-learn's tags,
+    which `BaseEstimator` has.
     """
     if isinstance(transformer, Reducer) and (
         transformer.n_spaces > 1 or not transformer.uses_labels
@@ -725,8 +731,8 @@ class CrossFitted(_Wrapping):
     def fit(self, X: ArrayLike, y: ArrayLike | None = None, *, folds: Ints | None = None) -> Self:
         """Fit clone k on the traces outside fold k, for every k, and replace `clones_`.
 
-        `trace_shape_` and `n_features_in_` are set, too. If a fit raises, `clones_` may already
-        hold clones that are not fitted.
+        A fold is one of K groups of traces. `trace_shape_` and `n_features_in_` are set, too. If a
+        fit raises, `clones_` may already hold clones that are not fitted.
 
         Parameters
         ----------

@@ -82,10 +82,11 @@ class Metrics:
     def observe(self, response: ServiceResponse | ReportResponse | RetrainReport) -> None:
         """Add the duration (`seconds`) of a response or a retrain to the histogram of its type.
 
-        There are three histograms: of decisions, reports and retrains. Their Prometheus labels are
-        values of the fields that `HISTOGRAMS` names, in lower case: of a decision its action and
-        its reason, of a report its label and whether it was repeated, of a retrain whether it was
-        accepted. Returns nothing. Raises KeyError for any other type.
+        There are three histograms: of decisions, of reported outcomes and of retrains. Their
+        Prometheus labels are values of the fields that `HISTOGRAMS` names, in lower case: of a
+        decision its action and its reason, of a report whether the part was good and whether the
+        report was repeated, of a retrain whether its model was put in force. Raises KeyError for
+        any other type.
         """
         kind = type(response)
         record = response.decision if isinstance(response, ServiceResponse) else response
@@ -102,10 +103,11 @@ class Metrics:
     def collect(self) -> Iterator[Metric]:
         """Yield gauges and counters with the present state of the engine and its queue.
 
-        They say for example which version is in force, whether the engine is in safe mode (it
-        verifies parts until new outcomes allow decisions), how many requests wait, and how many
-        were late or refused. Prometheus's registry calls this when the metrics are read. It reads
-        no database, so that it works while the store is unavailable.
+        They say for example which model version decides, whether the engine is in safe mode (after
+        an alarm every part is checked until new outcomes allow decisions), how many requests wait
+        in the queue, how many got no decision before the deadline, and how many were refused
+        because the queue was full. Prometheus's registry calls this when the metrics are read. It
+        reads no database, so that it works while the store is unavailable.
         """
         service = self._service
         engine = service.engine

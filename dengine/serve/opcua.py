@@ -90,10 +90,10 @@ class TokenUsers(UserManager):
     ) -> User | None:
         """Return the user of a new session, who may read and call; or None to refuse the session.
 
-        The password is the token, a text. A session is refused if the server encrypts and the
-        client has no certificate, or if the server has tokens and the user name or the token is
-        wrong, or the token only permits reading. `iserver` is not used, and the content of the
-        certificate is not checked.
+        A session is refused if the server encrypts and the client has no certificate. If the server
+        has access tokens, a session is also refused unless the user name is `dengine` and the
+        password is one of the tokens that permit more than reading; without tokens everybody gets a
+        user. `iserver` is not used, and the content of the certificate is not checked.
         """
         if self._encrypted and not certificate:
             return None
@@ -121,11 +121,13 @@ async def opcua_server(
     Parameters
     ----------
     service : CellService
+        The engine that is served, with its queue of requests.
     port : int
         0: any free port; `server.bserver.port` of the yielded server then says which.
     host : str
     tokens : tuple of Token, optional
-        Those of operators are passwords of the user `dengine`. Empty: everybody may read and call.
+        Access tokens. Those of operators (who may do more than read) are passwords of the user
+        `dengine`; a viewer's token gives no access. Empty: everybody may read and call.
     cert, key : path, optional
         Files in PEM. With them the server speaks only Basic256Sha256, signed and encrypted; without
         them it encrypts nothing.
@@ -133,13 +135,15 @@ async def opcua_server(
     Yields
     ------
     Server
-        The server, which listens. Its variables have the present status, if it could be read.
+        The server, which listens. Its variables have the cell's present status, like counts and
+        alarms, if that could be read.
 
     Raises
     ------
     SettingError
         For an address that other machines can reach, unless there are an operator's token, a
-        certificate and a key; and for a certificate and a key that `check_key_pair` refuses.
+        certificate and a key. Also if only one of `cert` and `key` is given, or they cannot be
+        used.
     OSError
         If the server cannot listen at this address, for example because the port is in use.
     """
@@ -202,11 +206,10 @@ class AddressSpace:
         self._alarm = ""
 
     async def build(self) -> None:
-        """Create the nodes of robot cell.xml in the server: the variables and the methods of the
-        cell.
+        """Create the nodes of the file cell.xml in the server: the cell's variables and methods.
 
-        It also links the methods Decide and Report to `decide` and `report`, and makes the object
-        that sends alarm events. Call it once, before the server starts.
+        It also links the OPC UA methods Decide and Report to `decide` and `report`, and makes the
+        object that sends alarm events. Call it once, before the server starts.
         """
         await self._server.import_xml(str(Path(__file__).with_name("cell.xml")))
         self._namespace = await self._server.get_namespace_index(NAMESPACE)
@@ -233,20 +236,22 @@ class AddressSpace:
     async def decide(self, trace: list[float], channels: int, request: str, part: str) -> list[Any]:
         """Decide on a flat trace: all samples of the first channel, then those of the next.
 
-        Returns a list: the action (0 verify, 1 accept, 2 reject), the id, the reason, the lower and
-        upper bound, and the version of the model. `request` is the caller's id of the trace, "" for
-        a new id; `part` is the part's number, "" for none. The same request id and trace get the
-        same decision again.
+        Returns a list: the action (0 verify, that is, check the part; 1 accept; 2 reject), the id,
+        the reason, the lower and upper bound of the success probability, and the version of the
+        model. `request` is the caller's id of the trace, "" for a new id; `part` is the part's
+        number, "" for none. If an id comes again with the same trace, its decision is returned
+        again.
 
-        After the service's deadline, or if the store fails, a new decision is VERIFY with the
-        reason "late" or "no_store", which may not be recorded. If the queue is full, or the service
-        or its engine is closed, nothing is recorded, and the result is VERIFY with an empty id, the
-        reason "busy", the bounds 0 and 1, and version 0.
+        If a request waits in the queue for longer than the service's deadline, a new decision is
+        VERIFY with the reason "late" or a fault of the trace, and if the store fails with the
+        reason "no_store"; such a decision may be missing from the store. If the queue is full, or
+        the service or its engine is closed, nothing is recorded, and the result is VERIFY with an
+        empty id, the reason "busy", the bounds 0 and 1, and version 0.
 
         Raises TraceError if the trace is empty, if `channels` is below 1 or the trace's length no
-        multiple of it, for a trace or part that the engine does not take, and for an id of another
-        trace. Raises ReportError for an invalid id, and SettingError for a first trace that the
-        settings do not allow.
+        multiple of it, for a trace whose shape or values the engine refuses, for an invalid part
+        number, and for an id that belongs to another trace. Raises ReportError for an invalid id,
+        and SettingError if the engine's first trace does not fit its settings.
         """
         if channels < 1 or len(trace) % channels or not trace:
             raise TraceError(
@@ -281,12 +286,13 @@ class AddressSpace:
     async def refresh(self) -> None:
         """Read the cell's status and write it into the OPC UA variables.
 
-        An event is sent if the text of the alarm has changed (`write_status`). If the status cannot
-        be read or written, or the event cannot be sent, a warning is logged and no error is raised.
-        All variables of the status then get the OPC UA status code UncertainLastUsableValue, which
-        marks them as old. They keep their values; those written before the error keep the new ones.
-        The variable LastRefused is not part of the status, and stays as it is. An error while the
-        variables are marked is raised.
+        The status has counts of decisions, the safe mode, the alarm and the like. An OPC UA event
+        is sent if the text of the alarm has changed (`write_status`). If the status cannot be read
+        or written, or the event cannot be sent, a warning is logged and no error is raised. All
+        variables of the status then get the OPC UA status code UncertainLastUsableValue, which
+        marks them as old; those written before the error keep the new values, the others their old
+        ones. The variable LastRefused (why the last call was refused) is not part of the status,
+        and stays as it is. An error while the variables are marked is raised.
         """
         try:
             await self.write_status(await self._calls.status())
@@ -301,10 +307,11 @@ class AddressSpace:
     async def write_status(self, status: Mapping[str, Any]) -> None:
         """Write a status, as `RobotCalls.status` returns it, into the OPC UA variables.
 
-        If the text of the alarm differs from that of the last call (before the first call: ""), an
-        event with the new text is sent, of severity 700. If the new text is empty, the event says
-        that the old alarm has ended, with severity 100. Raises KeyError for a status that lacks a
-        value of `STATUS_NAMES`.
+        `STATUS_NAMES` maps each variable to its key in the status. If the text of the alarm differs
+        from that of the last call (before the first call: ""), an OPC UA event with the new text is
+        sent, of severity 700. If the new text is empty, the event says that the old alarm has
+        ended, with severity 100. Raises KeyError if the status lacks one of the keys; variables
+        before it are written.
         """
         for name, key in STATUS_NAMES.items():
             node = self._node(name)
@@ -325,11 +332,11 @@ class AddressSpace:
     ) -> Callable[..., Awaitable[Any]]:
         """Return a method for asyncua that checks its arguments and calls `call` with their values.
 
-        `arguments` and `results` are the OPC UA descriptions of both. The method raises nothing. It
-        takes a null text for "", and returns the results as OPC UA variants. If an argument is
-        missing, is too many or has a wrong type, or if `call` raises an error, it returns a bad
-        status code and writes the reason into the variable LastRefused; an unexpected error is also
-        logged.
+        `arguments` and `results` are the OPC UA descriptions of the arguments and results of
+        `call`. The method returns the results as OPC UA variants, and passes a null argument on as
+        the text "". For a wrong number or type of arguments, or if `call` raises, it raises
+        nothing, but returns a bad status code, and writes the reason into the OPC UA variable
+        LastRefused. An error of `call` that is not dengine's own is also logged.
         """
         forms = [_form(_type_of(item), item.ValueRank > 0) for item in arguments]
         names = [item.Name for item in arguments]

@@ -146,10 +146,10 @@ def _prepare_process() -> None:
 
     From now on Linux kills the process when the thread that started it ends, even during a call
     into C++; on another system it ends when its parent process ends. It ends at once, with exit
-    code 1, if its parent has ended already. If the system has the functions for it, the process
-    leaves one of several cores to decisions and has a lower priority. It ignores the signals that
-    ask a process to end (`END_SIGNALS`): Ctrl-C reaches all processes of a terminal, but the server
-    ends this process in order.
+    code 1, if its parent has ended already. If the system has the functions for it, the process has
+    a lower priority and, of several cores, does not run on one, which is left to the decisions of
+    the server. It ignores the signals that ask a process to end (`END_SIGNALS`, like SIGINT):
+    Ctrl-C reaches all processes of a terminal, but the server itself ends this process.
     """
     parent = multiprocessing.parent_process()
     assert parent is not None  # it was spawned

@@ -87,13 +87,16 @@ class RobotCalls:
     async def begin(self, request: Any = "") -> str:
         """Begin a new part, and have the recorder wait for its insertion.
 
-        A piece is some samples of a trace, which `add` takes in a call of its own. Pieces that were
-        added under this id before are discarded. Pieces are kept for the newest `MAX_PARTS` parts;
-        for an older part call this again. The recorder, which records the force of one insertion,
-        works for the newest part alone: the recording of an earlier part that was not decided on is
-        dropped. With a recorder the call waits for a `decide_recorded` that is under way. If the
-        recorder fails, that is logged, and `decide_recorded` then verifies the part. Without a
-        recorder the trace can only be sent, by `add` or `decide`.
+        The trace of the part can be recorded by the server, or sent: as a whole by `decide`, or in
+        pieces (some samples each) by `add`. Pieces that were added under this id before are
+        discarded. Pieces are kept for the newest `MAX_PARTS` (8) parts; for an older part call this
+        again.
+
+        The recorder, if the server has one, records the force of one insertion for
+        `decide_recorded`. It works for the newest part alone: the recording of an earlier part that
+        was not decided on is dropped. With a recorder the call waits for a `decide_recorded` that
+        is under way. If the recorder fails, that is logged, and `decide_recorded` then answers
+        "verify" (check the part).
 
         Parameters
         ----------
@@ -126,7 +129,7 @@ class RobotCalls:
         return id_
 
     async def add(self, request: Any, samples: Any) -> int:
-        """Add a piece to a part's trace of one channel, after the pieces so far.
+        """Add a piece (some samples) to a part's trace of one channel, after the pieces so far.
 
         Parameters
         ----------
@@ -143,10 +146,10 @@ class RobotCalls:
         Raises
         ------
         TraceError
-            For a part that was not begun, is not among the newest `MAX_PARTS` any more, or was
-            decided on by `decide_added` since `begin`; for a piece that `as_samples` refuses, such
-            as one without samples, or that has a list for each channel; and for more than
-            `MAX_SAMPLES` samples of the part. A refused piece is not added.
+            For a part that was not begun, is not among the newest `MAX_PARTS` (8) any more, or was
+            decided on by `decide_added` since `begin`; for a piece of another type, without
+            samples, or with a list for each channel, and for bytes that are no float32; and for
+            more than `MAX_SAMPLES` (200,000) samples of the part. A refused piece is not added.
         ReportError
             For an invalid id.
         """
@@ -199,16 +202,20 @@ class RobotCalls:
         return await self.decide_array(as_samples(trace), request, part)
 
     async def decide_added(self, request: Any, part: Any = "") -> Struct:
-        """Decide on the trace whose pieces `add` took; return the dict that `decide` returns.
+        """Decide on the trace whose pieces `add` took; return a dict, like `decide`.
 
-        `request` is the id that `begin` returned, and `part` the part's number, "" for none. If the
-        id already has a decision, it is returned again, and the pieces are ignored. A new decision
-        drops the pieces, even if the store did not record it (reason "no_store"). If the queue is
+        The dict has the action (0 verify, that is, check the part; 1 accept; 2 reject), id, reason,
+        lower and upper (bounds of the success probability) and version of the model. `request` is
+        the id that `begin` returned, and `part` the part's number, "" for none. If the id already
+        has a decision, this is returned again, and the pieces are ignored. A new decision drops the
+        pieces, even if the store did not record it (reason "no_store"). If the queue of requests is
         full, or the service or its engine is closed, the result is VERIFY with an empty id and the
-        reason "busy", and the pieces stay, so that the call can be repeated. Raises TraceError if
-        there are no pieces (also for an id that has a decision, if it cannot be looked up now) or
-        the engine does not take the trace or part, ReportError for an invalid id, and SettingError
-        for a first trace that the settings do not allow.
+        reason "busy", and the pieces stay, so that the call can be repeated.
+
+        Raises TraceError if there are no pieces (also for an id that has a decision, if it cannot
+        be looked up now), for a trace whose shape or values the engine refuses, and for an invalid
+        part number; ReportError for an invalid id; and SettingError if the engine's first trace
+        does not fit its settings.
         """
         if (stored := await self._find(request)) is not None:
             return stored
@@ -224,15 +231,15 @@ class RobotCalls:
         return result
 
     async def decide_recorded(self, request: Any = "", part: Any = "") -> Struct:
-        """Decide on the trace that the recorder took of the insertion since `begin`.
+        """Decide on the trace that the server's recorder took of the insertion since `begin`.
 
         If the id already has a decision, it is returned again. Otherwise, or if the id cannot be
-        looked up now, the call waits up to `RECORD_SECONDS` for the recording. Only the part of the
-        newest `begin` has a recording, and only for one call, even if that call times out, is
-        refused or gets "busy". If there is no recording, or the recorder fails, which is logged,
-        the result is verify with an id "" and the reason "not_recorded", and nothing is stored. An
-        insertion that is incomplete after this time has NaN for its missing samples, so it is
-        verified and stored with that fault.
+        looked up now, the call waits up to `RECORD_SECONDS` (1 s) for the recording to be complete.
+        Samples that are missing then are NaN, so the part is verified, and the trace is stored with
+        that fault. Only the part of the newest `begin` has a recording, and only one call can use
+        it, even if that call raises or gets "busy". If there is no recording, or the recorder
+        fails, which is logged, the result is verify with an id "" and the reason "not_recorded",
+        and nothing is stored.
 
         Parameters
         ----------
@@ -245,16 +252,19 @@ class RobotCalls:
         Returns
         -------
         struct
-            A dict: action (0 verify, 1 accept, 2 reject), id, reason, lower and upper (bounds of
-            the success probability) and version. If the queue is full, or the service or its engine
-            is closed, verify with an id "" and the reason "busy".
+            A dict: action (0 verify, that is, check the part; 1 accept; 2 reject), id, reason,
+            lower and upper (bounds of the success probability) and version of the model. If the
+            queue of requests is full, or the service or its engine is closed, verify with an id ""
+            and the reason "busy".
 
         Raises
         ------
         SettingError
-            For a server without a recorder, and for a first trace that the settings do not allow.
+            For a server without a recorder, and if the engine's first trace does not fit its
+            settings.
         TraceError, ReportError
-            For a trace, part or id that the engine does not take.
+            TraceError for a trace whose shape or values the engine refuses, or an invalid part
+            number, ReportError for an invalid id.
         """
         if self._recorder is None:
             raise SettingError(
@@ -299,17 +309,21 @@ class RobotCalls:
         return int((await self.decide_recorded(request, part))["action"])
 
     async def decide_array(self, trace: ArrayLike, request: Any, part: Any) -> Struct:
-        """Decide on a trace of shape (T,) or (C, T); return a dict of action, id, reason, lower,
-        upper and version.
+        """Decide on a trace of shape (T,) or (C, T); return the decision as a dict.
+
+        The dict has the action (0 verify, that is, check the part; 1 accept; 2 reject), id, reason,
+        lower and upper (bounds of the success probability) and version of the model.
 
         `request` is the caller's id of the trace, "" for a new one; `part` is the part's number, ""
-        for none. The same request id and trace get the same decision again. After the
-        service's deadline, or if the store fails, a new decision is VERIFY with the reason "late"
-        or "no_store", which may not be recorded (`CellService.decide`). If the queue is full, or
-        the service or its engine is closed, that is logged, and the dict is an unrecorded VERIFY
-        with an id "" and the reason "busy". Raises TraceError for a trace or part that the engine
-        does not take and for an id of another trace, ReportError for an invalid id, and
-        SettingError for a first trace that the settings do not allow.
+        for none. If an id comes again with the same trace, its decision is returned again. If a
+        request waits in the queue for longer than the service's deadline, a new decision is VERIFY
+        with the reason "late" or a fault of the trace, and if the store fails with the reason
+        "no_store"; such a decision may be missing from the store (`CellService.decide`). If the
+        queue is full, or the service or its engine is closed, that is logged, and the dict is an
+        unrecorded VERIFY with an id "" and the reason "busy". Raises TraceError for a trace whose
+        shape or values the engine refuses, an invalid part number and an id that belongs to another
+        trace, ReportError for an invalid id, and SettingError if the engine's first trace does not
+        fit its settings.
         """
         id_ = as_id(request) if request != "" else None
         try:
@@ -328,15 +342,16 @@ class RobotCalls:
         -------
         bool
             True if the label is on disk, also if it was reported before. False if the id is "" or
-            unknown. False also if the report cannot be stored now, which is logged; only then
-            repeat it.
+            unknown: do not repeat the call. False also if the report cannot be stored now, which is
+            logged: repeat it later.
 
         Raises
         ------
         ReportError
-            For a report that contradicts an earlier label, unless it says bad of an accepted part
-            that was confirmed as good before; for any report if a person withdrew the label; for a
-            value that is no label; and for an invalid id.
+            For a report that contradicts an earlier label; but a report that an accepted part was
+            bad is taken even if the part counted as good before; it corrects the label. Also for
+            any report if a person withdrew the label, for a value that is no label, and for an
+            invalid id.
         """
         if decision_id == "":  # of an unrecorded VERIFY
             return False
@@ -352,26 +367,28 @@ class RobotCalls:
     async def status(self) -> Struct:
         """Return how the robot cell is doing, in plain numbers and texts.
 
-        It waits in the queue until the engine has written all that it recorded, which may discard
-        a training or retrain the model (`CellService.read`). While the store is read no decision
-        waits, unless the store is in memory.
+        First the engine writes to the store what it has recorded (`CellService.read`); this waits
+        in the queue of requests, and may discard a training under way or retrain the model. While
+        the store is then read no decision waits, unless the store is in memory.
 
         Returns
         -------
         struct
-            A dict: decisions, accepted, rejected, bad (false accepts): counts so far.
-            verified_share: share of verified parts among the newest 500 decisions, 1 if there are
-            none. version: number of the version in force. safe_mode, alarm: their reasons as texts,
-            "" if there is none. shadow: whether the shadow mode is on. waiting: requests in the
-            queue. late, busy: since the start, numbers of decisions that the engine had not begun
-            by the service's `deadline`, and of requests refused because the queue was full.
+            A dict. decisions, accepted, rejected, bad (accepted parts that were bad): counts so
+            far. verified_share: share of verified (checked) parts among the newest 500 decisions, 1
+            if there are none. version: number of the model version that decides. safe_mode: why the
+            safe mode began, in which every part is verified; alarm: what a person must look at;
+            both are texts, "" if there is nothing. shadow: whether every part is verified while the
+            model only predicts. waiting: requests in the queue. late, busy: since the start,
+            numbers of decisions that the engine had not begun within the service's `deadline`, and
+            of requests refused because the queue was full.
 
         Raises
         ------
         BusyError, StoreError
             If the queue is full or the service is closing, or if the store cannot be read.
         SettingError
-            For a stored recipe that cannot be read.
+            For a stored recipe (the engine's settings) that cannot be read.
         """
         service = self._service
         status = await service.status()
@@ -393,7 +410,7 @@ class RobotCalls:
         }
 
     async def _find(self, request: Any) -> Struct | None:
-        """Return the decision that was made under the id `request`, as the dict that a robot gets.
+        """Return the decision that was made under the id `request`, as a dict (`_as_struct`).
 
         None if the id has no decision, and also if the queue is full, the service is closing, or
         the store cannot look the id up. Raises ReportError for an invalid id.
@@ -413,9 +430,11 @@ def one_line(text: str) -> str:
 
 
 def _as_struct(decision: Decision) -> Struct:
-    """Return a decision as a dict of plain types: action (0 verify, 1 accept, 2 reject), id,
-    reason (a text), lower and upper, the bounds of the success probability, and version, the number
-    of the model version that decided.
+    """Return a decision as a dict of plain types, for a robot's program.
+
+    It has the action (0 verify, that is, check the part; 1 accept; 2 reject), id, reason (a text),
+    lower and upper (bounds of the success probability), and version, the number of the model
+    version that decided.
     """
     return {
         "action": ACTIONS.index(decision.action),

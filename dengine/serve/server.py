@@ -111,11 +111,14 @@ def serve(
 ) -> None:
     """Serve a robot cell until SIGTERM, SIGINT, or Ctrl-Break of Windows; it blocks until then.
 
-    Then the requests under way have `GRACE` (5) seconds to be answered; a SIGINT after another of
-    these signals ends without waiting for them. The engine does what is in the queue, and is
-    closed. In a thread other than the main thread no signal ends the call. A signal that comes
-    before the server listens acts like in any other program. The handlers of the root logger are
-    replaced for good: every log message becomes a line on stderr (`log_lines`).
+    It opens the engine, and answers requests for decisions, reports and the like over HTTP and
+    XML-RPC and, if wanted, OPC UA.
+
+    After a signal the requests under way have `GRACE` (5) seconds to be answered; a SIGINT after
+    another of these signals ends without waiting for them. The engine does what is in the queue,
+    and is closed. In a thread other than the main thread no signal ends the call. A signal that
+    comes before the server listens acts like in any other program. The handlers of the root logger
+    are replaced for good: every log message becomes a line on stderr (`log_lines`).
 
     Parameters
     ----------
@@ -127,9 +130,9 @@ def serve(
     say : callable
         Called with a line that says where the server listens, once it does.
     beside : sequence of callable
-        Each is called with the service and returns an async context, which lasts as long as the
-        server, in the same event loop. If the start of a context fails, no request is answered, and
-        the error is raised.
+        Each is called with the `CellService` (the engine with its queue of requests) and returns an
+        async context, which lasts as long as the server, in the same event loop. If the start of a
+        context fails, no request is answered, and the error is raised.
     recorder : callable
         Returns a context manager that opens the recorder of a robot's insertions for as long as the
         server runs, or gives None.
@@ -138,16 +141,18 @@ def serve(
     port : int
         0: any free one.
     token_file : path or None
-        As `read_tokens` takes it. None: no request needs a token, and only this machine may reach
-        the server.
+        Access tokens, one in each line (`read_tokens`). None: no request needs a token, and only
+        this machine may reach the server.
     cert, key : path or None
         PEM files for TLS, both or none.
     deadline : float
-        Seconds that a decision may wait in the queue; after that its part is verified.
+        Seconds that a request for a decision may wait in the queue; then the answer is VERIFY: the
+        part must be checked.
     check_seconds : float
-        Duration of a verification, from which the saved time is computed.
+        Duration of one check of a part, from which the time saved by other decisions is computed.
     opcua : int or None
-        Port of OPC UA; None: off. Only the tokens of operators are its passwords.
+        Port of OPC UA; None: off. Its passwords are the tokens of operators, not those that only
+        permit reading.
     opcua_cert, opcua_key : path or None
         None: `cert` and `key`.
 
@@ -235,10 +240,11 @@ class CellServer(uvicorn.Server):
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
         """Handle SIGINT, SIGTERM and Ctrl-Break as a request to end in order.
 
-        Each signal is logged, ends every iteration over `CellService.changes`, and asks uvicorn to
-        end after the requests under way, which have `GRACE` seconds; a SIGINT after another of
-        these signals makes it end without waiting for them. Unlike uvicorn's own method it does not
-        note the signal to be raised again after the end, so the exit code is 0.
+        Each signal is logged, ends every iteration over `CellService.changes` (by which clients
+        wait for changes), and asks uvicorn to end after the requests under way, which have `GRACE`
+        (5) seconds; a SIGINT after another of these signals makes it end without waiting for them.
+        Unlike uvicorn's own method it does not note the signal to be raised again after the end, so
+        the exit code is 0.
         """
         log.info("%s: ending, what is in line is answered", signal.Signals(sig).name)
         self._service.end_listening()
@@ -251,9 +257,9 @@ def quick_switches() -> Iterator[None]:
     """Shorten, within the block, the time that a decision can wait for another thread.
 
     For the whole process it shortens the interval after which Python switches threads to
-    `SWITCH_INTERVAL` seconds, and excludes the objects that exist now from garbage collection. The
-    end of the block sets the old interval, and lets all objects be collected again, also those that
-    other code froze (`gc.freeze`).
+    `SWITCH_INTERVAL` (0.0005) seconds, and excludes the objects that exist now from garbage
+    collection. The end of the block sets the old interval, and lets all objects be collected again,
+    also those that other code froze (`gc.freeze`).
     """
     before = sys.getswitchinterval()
     sys.setswitchinterval(SWITCH_INTERVAL)
@@ -291,9 +297,10 @@ def listening_socket(host: str, port: int) -> Iterator[socket.socket]:
 
 
 def log_safe_mode(reason: str) -> None:
-    """Log that the safe mode, in which parts are verified, began or ended.
+    """Log that the safe mode began or ended.
 
-    `reason` says why it began, which is logged as a warning; "" means that it ended.
+    In safe mode, after an alarm, every part is checked until new outcomes allow decisions. `reason`
+    says why it began, which is logged as a warning; "" means that it ended.
     """
     if reason:
         log.warning("safe mode, parts are verified until outcomes allow decisions: %s", reason)

@@ -207,13 +207,15 @@ class CellService:
         Returns
         -------
         ServiceResponse
-            The engine's decision, which is waited for if the engine has begun it by the deadline.
-            Otherwise the call returns a decision all the same, and the attribute `late` counts it:
-            the decision that the id already has, or else VERIFY with `Reason.LATE` or the fault of
-            the trace or the store; with a store in memory, and while no `TraceSpec` is in force,
-            this VERIFY is not recorded. If the store cannot be written or cannot look up the id,
-            the decision is VERIFY with `Reason.NO_STORE`, and may not be recorded. The response is
-            also passed to each of `observers`, whose exceptions are raised.
+            The decision, whether it was late, and the seconds until the response. If the engine has
+            begun the decision by the deadline (`deadline` seconds), the call waits for it.
+            Otherwise the call decides without the model, and the attribute `late` counts it: the
+            decision is the one that the id already has, or else VERIFY (check the part), with
+            `Reason.LATE` or with a fault of the trace or the store as its reason. This VERIFY is
+            recorded, but not with a store in memory, and not before the engine's `TraceSpec`
+            (shape, rate and unit of its traces) is known. If the store cannot be written or cannot
+            look up the id, the decision is VERIFY with `Reason.NO_STORE`, and may not be recorded.
+            The response is also passed to each of `observers`, whose exceptions are raised.
 
         Raises
         ------
@@ -221,8 +223,9 @@ class CellService:
             For a wrong shape, values that are no real numbers, a first trace of less than 10
             samples, an invalid part number, or an id that belongs to another trace.
         SettingError
-            For a first trace that the policy's force limits do not fit, or whose `TraceSpec`
-            contradicts that of another robot cell of the product.
+            For the engine's first trace, if an operator's limits of the force do not fit it, or if
+            the `TraceSpec` made from it contradicts that of another robot cell with which this one
+            shares labels and models.
         ReportError
             For an invalid id.
         StoreError
@@ -264,33 +267,35 @@ class CellService:
         ----------
         decision_id : str
         success : bool or float
-            1 or True: good. If the decision has this label already, also by a correction, nothing
-            is done.
+            1 or True: the part was good. If the decision has this label already, reported or
+            corrected later by a person, nothing is done.
         author : str
-            The person who reports, for the event log. "": a machine's report, which is not recorded
-            as an event. A repeated report is not recorded either.
+            The person who reports; an event (a row in the store's log) then says so. "": a
+            machine's report, of which no event is stored; nor of a repeated report.
 
         Returns
         -------
         ReportResponse
-            It is also passed to each of `observers`; what an observer raises is raised. They get
-            the report of the retrain that the label set off from the engine's thread (`_next_job`).
+            Id, label, whether the report was repeated, the report of a retrain that the label set
+            off, if that is finished, and the seconds that this took. It is also passed to each of
+            `observers`; what an observer raises is raised. The report of a retrain is passed to
+            them separately, later and from the engine's thread.
 
         Raises
         ------
         ReportError
             For an unknown or invalid id, for a value that is no label, and for another label than
-            the one that the decision has; but a line stop after a confirmation is no error and
-            corrects the label. If the label of the decision was forgotten, for every label, also
-            the same and that of a line stop.
+            the one that the decision has. But a report that an accepted part was bad is taken even
+            if the part counted as good before; it corrects the label. If a person withdrew the
+            label of the decision, every report raises this error.
         StoreError
             If the label is not known to be on disk, or the id cannot be looked up: report it again.
             If the decision was not recorded because its id could not be looked up: decide again.
             Also if the stored trace is damaged, if the engine is closed, and if only the event
             cannot be stored; the event is then missing for good.
         Exception
-            What the copying of a handed-in model raises, before a retrain; the label is on disk
-            then, and the event is missing.
+            What the copying of a model raises that the user gave to the engine, before a retrain;
+            the label is on disk then, and the event is missing.
         BusyError
             If the queue is full, the service is closing, or the engine's thread has ended.
         """
@@ -359,7 +364,7 @@ class CellService:
 
         `work` is called with the engine and with whether the future was cancelled. A cancelled
         future does not stop the work, but the result is dropped. After the work every iteration
-        over `changes`, by which clients hear of changes, goes on, unless the work is `read_only`.
+        over `changes`, by which clients wait for changes, goes on, unless the work is `read_only`.
         Raises BusyError if the service is closing, if the engine's thread has ended, or if the
         queue is full; only a full queue is counted, in `busy`.
         """
@@ -379,12 +384,14 @@ class CellService:
     async def read(self, work: Callable[[SqlStore], T]) -> T:
         """Have the engine write its records to the store, and return what `work(store)` returns.
 
-        The writing (`DataEngine.flush`) waits in the queue. After a line stop or check that came
-        late it also corrects the rule, and may discard a training or retrain the model. Records
-        that the disk or the store does not take in time are missing, without an error. `work` must
-        only read. It runs in another thread over a second connection to the store (`read_store`),
-        or in the engine's thread if the store is in memory. Raises BusyError if the queue is full,
-        the service is closing, or the engine's thread has ended, and whatever `work` raises.
+        Records are decisions, labels and events. Their writing (`DataEngine.flush`) waits in the
+        queue. If an outcome came late and contradicts what the engine had assumed of the part, the
+        writing also corrects the engine's decision rule, and may discard a training under way or
+        retrain the model. Records that the disk or the store does not take in time are missing,
+        without an error. `work` must only read. It runs in another thread over a second connection
+        to the store (`read_store`), or in the engine's thread if the store is in memory. Raises
+        BusyError if the queue is full, the service is closing, or the engine's thread has ended,
+        and whatever `work` raises.
         """
         with suppress(NotTakenError):
             await self.call(lambda engine: engine.flush(), read_only=True)
@@ -420,11 +427,11 @@ class CellService:
     async def changes(self, quiet: float) -> AsyncIterator[bool]:
         """Yield True at once, and then whenever something has changed since the last yield.
 
-        A change is each call of the engine that is not read-only, even if it raised, and each
-        report that `DataEngine.poll` returns between two calls, also that of a retrain that `read`
-        has done. Anything else that a read-only call changes does not count. After `quiet` seconds
-        without a change False is yielded. The iteration ends when `end_listening` is called, and
-        yields nothing if it was called before.
+        A change is each call of the engine that is not read-only, even if it raised, and each new
+        model version or retrain that the engine reports between two calls (`DataEngine.poll`).
+        Anything else that a read-only call changes does not count. After `quiet` seconds without a
+        change False is yielded. The iteration ends when `end_listening` is called, and yields
+        nothing if it was called before.
         """
         event = asyncio.Event()
         listener = (asyncio.get_running_loop(), event)
@@ -472,8 +479,7 @@ class CellService:
             self.read_store.close()
 
     def _notify_observers(self, response: T) -> T:
-        """Call each function in `observers` with a response or a `RetrainReport`; return the
-        argument.
+        """Call each function in `observers` with a response or a `RetrainReport`; return it.
 
         A `RetrainReport` is also logged. What an observer raises is raised; the observers after it
         are not called then.
@@ -491,12 +497,13 @@ class CellService:
         return response
 
     def _run_jobs(self, make: Callable[[], DataEngine], opened: Future[DataEngine]) -> None:
-        """Open the engine by `make`, run jobs until None comes out of the queue, and close it.
+        """Open the engine by `make`, run jobs until the queue gives None, and close the engine.
 
         This is the body of the engine's thread. `opened` gets the engine, or the exception that
         `make` raised; the thread ends after such an exception. While the queue is empty, the engine
         does its other work, like retrains (`_next_job`). After each job that is not `read_only` and
-        each finished retrain, every iteration over the service's `changes` yields True.
+        each finished retrain, every iteration over `changes`, by which clients wait for changes,
+        yields True. Exceptions of a job are not raised here.
         """
         try:
             engine = make()
@@ -515,11 +522,11 @@ class CellService:
 
         While the queue is empty, the engine does its other work (`DataEngine.poll`): it retrains if
         that is due, puts a trained version in force step by step, and calls `on_safe_mode`, a
-        function that it was made with, if a safe mode, in which parts are verified, began or ended.
-        If this gives a report, of a retrain or of a version that a rollback, a release or a new
-        policy made, each of `observers` is called with it; then every iteration over `changes`, by
-        which clients hear of changes, goes on. An error in this work, or of an observer, is logged
-        and not raised.
+        function that it was made with, if a safe mode (every part is checked after an alarm) began
+        or ended. If this gives a report, of a retrain or of a version that a person's change made
+        (like a return to an earlier version), each of `observers` is called with it; then every
+        iteration over `changes`, by which clients wait for changes, goes on. An error in this work,
+        or of an observer, is logged and not raised.
         """
         # The time right after a response is best for other work: the next part is farthest away.
         timeout = SHORT_WAIT

@@ -38,7 +38,7 @@ def parse_call(body: bytes) -> tuple[str, tuple[Any, ...]]:
 
     The arguments are Python values of the types that XML-RPC has, base64 as bytes; the tuple is
     empty for a call without arguments. Whether there is such a method is not checked. Raises
-    ValueError for a body that is no XML, is no call, or has a document type.
+    ValueError for a body that is no XML, is no call, or has a document type declaration.
     """
     values: Any = xmlrpc.client.Unmarshaller(use_builtin_types=True)
     parser = DefusedExpatParser(values, forbid_dtd=True)
@@ -77,9 +77,9 @@ async def call_method(calls: RobotCalls, body: bytes) -> bytes:
     `calls` has the methods, of which those in `CALLS` may be called, and `body` is the request,
     which is parsed in another thread. It raises nothing: every error becomes a fault with one line
     of text and a code. The codes are -32700 for a body that cannot be read, -32601 for an unknown
-    method, -32602 for a wrong number of arguments, 2 for a ReportError, and 1 for another
-    DengineError. Any other error of the method, and a value that XML-RPC cannot carry, have -32603;
-    only these two are logged.
+    method, -32602 for a wrong number of arguments, 2 for a ReportError, and 1 for any other error
+    that dengine raises on purpose (DengineError). Any other error of the method, and a value that
+    XML-RPC cannot carry, have -32603; only these two are logged.
     """
     try:
         name, arguments = await asyncio.to_thread(parse_call, body)

@@ -53,11 +53,13 @@ class BackupReport:
 def backup_store(url: FilePath, out: FilePath) -> BackupReport:
     """Copy an SQLite store into a new file, and add to the copy what the cells' journals hold.
 
-    Engines may run meanwhile: every decision, label and event that was on disk when this was called
-    is in the copy. Damaged records of a journal are left out, and a record that contradicts the
-    copy, or that its database refuses, becomes an event of kind "dead letter" there, which is also
-    logged. The copy is written in full or not at all; it is not in WAL mode. The store and the
-    journals are only read, but a store that is not in WAL mode is set to it if it can be written.
+    A journal is the file to which the engine of a robot cell writes each decision, label and event
+    before the store gets it. Engines may run meanwhile: every decision, label and event that was on
+    disk when this was called is in the copy. Damaged records of a journal are left out, and a
+    record that contradicts the copy, or that its database refuses, becomes an event of kind "dead
+    letter" there, which is also logged. The copy is written in full or not at all; it is not in WAL
+    mode. The store and the journals are only read, but a store that is not in WAL mode is set to it
+    if it can be written.
 
     Parameters
     ----------
@@ -77,8 +79,9 @@ def backup_store(url: FilePath, out: FilePath) -> BackupReport:
     StoreError
         If `url` is no store or cannot be read, if it is a PostgreSQL store (pg_dump copies that),
         and if a journal cannot be read. If a journal holds records, also if the ledger of its cell
-        was begun with another key than the one in the file that DENGINE_LEDGER_KEY names, if that
-        file cannot be read, or if the records cannot be written to the copy.
+        (the hash chain over its rows) was begun with another key than the one in the file that the
+        environment variable DENGINE_LEDGER_KEY names, if that file cannot be read, or if the
+        records cannot be written to the copy.
     OutputError
         If `out` exists, or the `-wal` file of an earlier store beside it, or if `out` cannot be
         written, for example on a full disk. Also if SQLite finds damage in the store while it
@@ -125,11 +128,13 @@ def backup_store(url: FilePath, out: FilePath) -> BackupReport:
 def restore_store(copy: FilePath, store: FilePath) -> tuple[CellHistory, ...]:
     """Copy a backup into a new file `store`, and make a journal beside it for each robot cell.
 
-    The journal names the newest ledger entry that its cell has in `copy`, so that the engine that
-    opens the cell next can tell that nothing is missing. A journal that is already beside `store`
-    is not changed: the next engine of its cell takes the records from it that the copy lacks. If
-    the journal names a ledger entry that the copy lacks, this engine also records an alarm. Records
-    of journals that are beside `copy` are added, as by `backup_store`.
+    A journal is the file to which the engine of a cell writes each decision, label and event before
+    the store gets it. The new journal names the newest entry of the cell's ledger (the store's hash
+    chain) in `copy`, so that the engine that opens the cell next can tell that nothing is missing.
+    A journal that is already beside `store` is not changed: the next engine of its cell takes the
+    records from it that the copy lacks. If the journal names a ledger entry that the copy lacks,
+    this engine also records an alarm. Records of journals that are beside `copy` are added to
+    `store`, as by `backup_store`.
 
     Parameters
     ----------
@@ -149,9 +154,10 @@ def restore_store(copy: FilePath, store: FilePath) -> tuple[CellHistory, ...]:
     Raises
     ------
     StoreError
-        If `copy` is no store, if `verify_history` finds any fault in it, also data that were lost
-        and that nobody has acknowledged, and for the other reasons of `verify_history` and
-        `backup_store`. If a journal cannot be made: the store has been copied by then, and stays.
+        If `copy` is no store, if `verify_history` finds any fault in it (like changed or missing
+        rows, or an earlier loss of data that nobody has acknowledged), and for the other reasons of
+        `verify_history` and `backup_store`. If a journal cannot be made: the store has been copied
+        by then, and stays.
     OutputError
         If `store` or its `-wal` file exists, or it cannot be written, for example on a full disk.
     OSError
@@ -176,9 +182,10 @@ def restore_store(copy: FilePath, store: FilePath) -> tuple[CellHistory, ...]:
 def _add_records(file: Path, cell: str, records: list[Record]) -> None:
     """Commit records of a cell's journal to `file`, the copy; without records do not open it.
 
-    Records that the copy already has change nothing. A record that contradicts the copy, or that
-    its database refuses, is stored there as an event of kind "dead letter", and logged. Raise
-    StoreError if the cell's ledger has another key than the file that DENGINE_LEDGER_KEY names, if
+    A record is a decision, a label or an event. Records that the copy already has change nothing. A
+    record that contradicts the copy, or that its database refuses, is stored there as an event of
+    kind "dead letter", and logged. Raise StoreError if the cell's ledger (the hash chain over its
+    rows) has another key than the file that the environment variable DENGINE_LEDGER_KEY names, if
     that file cannot be read, or if the copy cannot be written; records that were committed before
     stay.
     """

@@ -262,8 +262,8 @@ def reading(url: str) -> Iterator[sa.Connection]:
 def run_integrity_check(connection: sa.Connection, table: str = "") -> list[str]:
     """Run SQLite's integrity check on the whole file, or on one table.
 
-    Return its findings as texts, at most 100, [] if all is well. A database error is the only
-    finding then, and not raised.
+    Return its findings as texts, at most 100, [] if all is well. If the database fails, nothing is
+    raised, and the text of its error is the only finding.
     """
     try:
         lines = connection.execute(
@@ -345,16 +345,17 @@ class Database:
                 self._file = file, file.stat()
 
     def _open(self, product: str | None) -> Scope:
-        """Create the tables or check them, add the robot cell to them if it is new, set
-        `newest_entry`.
+        """Create or check the tables, add the robot cell if it is new, and set `newest_entry`.
 
         Columns that an older store lacks are added. `newest_entry` becomes number and digest of the
-        cell's newest entry in its ledger, a hash chain. A new cell gets `product`, and its ledger
-        begins with the key in the file that DENGINE_LEDGER_KEY names, or without a key if it names
-        none or the store is in memory. Return the cell with its product; it has none if neither the
-        store nor `product` names one. Raise StoreError, and disconnect, if the database cannot be
-        opened or is no store of this schema, if the ledger of the cell was begun with another key,
-        and if `join_product` refuses the product, for example for a cell that has another one.
+        newest entry in the cell's ledger (the hash chain over its rows). A new cell gets `product`,
+        the name that it has in common with the cells with which it shares labels and models. Its
+        ledger begins with the key in the file that the environment variable DENGINE_LEDGER_KEY
+        names, or without a key if there is no such variable or the store is in memory. Return the
+        cell with its product; it has none if neither the store nor `product` names one. Raise
+        StoreError, and disconnect, if the database cannot be opened or is no store of this schema,
+        if the ledger of the cell was begun with another key, and if `join_product` refuses the
+        product, for example for a cell that has another one.
         """
         try:
             with _store_errors("open", self.name), self._engine.connect() as plain:
@@ -373,11 +374,11 @@ class Database:
     def reading(self) -> Iterator[sa.Connection]:
         """Context manager that opens a read transaction and gives its connection.
 
-        First it calls `before_use`, a function that the outbox has set, which writes the records
-        that wait in it, so that they are seen; if the database of a running robot cell does not
-        take them in time, they are missing. Raise StoreError if the database fails, is closed or
-        was opened before a fork, and in place of a ValueError, TypeError, OverflowError or OSError
-        that the block raises, unless it is dengine's own.
+        First it calls `before_use`, which writes what the engine has recorded but not written yet,
+        so that the block sees it; what the database of a running robot cell does not take in time
+        is missing. Raise StoreError if the database fails, is closed or was opened before a fork,
+        and in place of a ValueError, TypeError, OverflowError or OSError that the block raises,
+        unless it is dengine's own.
         """
         self.check_open()
         self.before_use()
@@ -386,21 +387,22 @@ class Database:
 
     @contextmanager
     def _transaction(self) -> Iterator[sa.Connection]:
-        """Context manager that opens a write transaction, locks the robot cell and gives the
-        connection.
+        """Context manager that opens a write transaction of the robot cell; gives the connection.
+
+        The cell is locked, which keeps other transactions from writing rows of the cell until this
+        one ends; SQLite locks the whole file.
 
         After the block an entry for the rows that it added is inserted into the ledger, the cell's
         hash chain, and both are committed. Then `newest_entry` becomes number and digest of this
-        entry, and `on_entry`, set by the outbox (through which an engine records), is called. If
-        the block added no rows and changed no settings, there is no entry. On an error everything
-        is rolled back. Errors of the database, and OSError, ValueError, TypeError and
-        OverflowError, become StoreError; dengine's own errors and all others pass unchanged.
+        entry, and the function `on_entry` is called. If the block added no rows and changed no
+        settings, there is no entry. On an error everything is rolled back. Errors of the database,
+        and OSError, ValueError, TypeError and OverflowError, become StoreError; dengine's own
+        errors and all others pass unchanged.
 
         StoreError is raised, too, if the function given to `commit_if` returns False, and if the
-        SQLite file was replaced. If this is noticed only after the commit, the rows are in the
-        file that was replaced; and if the connection to a server broke during the commit, the
-        server may have the rows. The lock keeps other transactions from writing rows of the cell
-        until this one ends; SQLite locks the whole file.
+        SQLite file was replaced. If this is noticed only after the commit, the rows are in the file
+        that was replaced; and if the connection to a server broke during the commit, the server may
+        have the rows.
         """
         with _store_errors("write to", self.name), self._writer.connect() as connection:
             connection.execution_options(dengine_write=True)
@@ -450,9 +452,9 @@ class Database:
     def has_entry(self, number: int, digest: str) -> bool:
         """Return whether the cell's ledger has an entry with this number and hexadecimal digest.
 
-        The ledger is a hash chain. The records that wait in the outbox are written first, if the
-        database takes them in time. Raise StoreError if the database fails, is closed or was opened
-        before a fork.
+        The ledger is a hash chain over the cell's rows. What the engine has recorded but not
+        written yet is written first, if the database takes it in time. Raise StoreError if the
+        database fails, is closed or was opened before a fork.
         """
         rows = self.read(
             sa.select(LEDGER.c.digest).where(self.own(LEDGER), LEDGER.c.number == number)
@@ -460,22 +462,23 @@ class Database:
         return [row.digest.hex() for row in rows] == [digest]
 
     def check_integrity(self, window: int, since: int | None = None) -> str:
-        """Compare the rows that an engine reads with the ledgers (hash chains) of their robot
-        cells.
+        """Compare the rows that an engine reads with the ledgers (hash chains) of their cells.
 
-        These are settings, labels, corrections of labels and model versions of this cell and the
-        other cells of its product. Of the labels only the newest are checked. The rest is checked
-        in full, except for the arrays of the versions and the settings that the store itself keeps
-        (`RESERVED`); of each ledger itself only the newest entry. A ledger with another key than
-        the one with which the store was opened counts as a difference, too. The records that wait
-        in the outbox are written first, if the database takes them in time.
+        These are settings, labels, corrections of labels and model versions of this robot cell and
+        the other cells of its product (with which it shares labels and versions). Of the labels
+        only the newest are checked, and of each ledger itself only the newest entry. The rest is
+        checked in full, except for the arrays of the versions and the settings that the store
+        itself keeps (`RESERVED`). A ledger with another key than the one with which the store was
+        opened counts as a difference, too. What the engine has recorded but not written yet is
+        written first, if the database takes it in time.
 
         Parameters
         ----------
         window : int
-            How many of the newest labels are checked, at least. Labels of quarantined traces among
-            them are checked, too, but not counted. In a product the newest 2 * `window` labels of
-            all its cells together are checked instead, and every label counts.
+            How many of the newest labels are checked, at least. Labels of quarantined traces (never
+            used in training) among them are checked, too, but not counted. In a product the newest
+            2 * `window` labels of all its cells together are checked instead, and every label
+            counts.
         since : int or None
             If given, the labels after this number are checked instead of the newest `window`.
 
@@ -501,8 +504,9 @@ class Database:
         """Run SQLite's integrity check on the tables that engines read, all but traces and events.
 
         Return its first finding, or the text of the error if the check fails, which also happens
-        after `close`; "" if all is well. PostgreSQL and a store in memory are not checked: "". The
-        records that wait in the outbox are written first, if the database takes them in time.
+        after `close`; "" if all is well. PostgreSQL and a store in memory are not checked: "". What
+        the engine has recorded but not written yet is written first, if the database takes it in
+        time.
         """
         for name in CHECKED_TABLES if self._file is not None else ():
             try:
@@ -516,8 +520,8 @@ class Database:
     def check_writable(self) -> None:
         """Raise a StoreError if the database cannot be written; an update of no row shows this.
 
-        The records that wait in the outbox are written first, if the database takes them in time;
-        the update itself adds nothing to the ledger.
+        What the engine has recorded but not written yet is written first, if the database takes it
+        in time. The update itself adds nothing to the ledger (the hash chain over the rows).
         """
         self.write(
             lambda connection: connection.exec_driver_sql(
@@ -526,8 +530,7 @@ class Database:
         )
 
     def acquire_lease(self) -> None:
-        """Lock the robot cell on a PostgreSQL server, and write from now on through that one
-        connection.
+        """Lock the robot cell on a PostgreSQL server; write from now on through that connection.
 
         Only one engine has the lock of a cell (the lease). It lasts as long as the connection; if
         that is lost, the next connection locks again, and if another engine has the lock by then,
@@ -590,12 +593,12 @@ class Database:
     def write(self, add_rows: Callable[[sa.Connection], T]) -> T:
         """Call `add_rows` in a write transaction, commit it, and return what `add_rows` returned.
 
-        First `before_use` is called, a function that the outbox has set, so that the records that
-        wait in the outbox are written before these rows, if the database takes them in time. The
-        call waits until another write transaction of this object has ended, and for the lock of the
-        SQLite file, or of the robot cell on a server. If rows were added or settings changed, the
-        commit includes a ledger entry for them; then `newest_entry` is set to this entry, and
-        `on_entry`, a function that the outbox has set, is called.
+        First `before_use` is called, which writes what the engine has recorded but not written yet,
+        so that it precedes these rows, if the database takes it in time. The call waits until
+        another write transaction of this object has ended, and for the lock of the SQLite file, or
+        of the robot cell on a server. If rows were added or settings changed, the commit includes
+        an entry for them in the ledger (a hash chain); then `newest_entry` becomes number and
+        digest of this entry, and the function `on_entry` is called.
 
         Parameters
         ----------
@@ -606,11 +609,11 @@ class Database:
         ------
         StoreError
             If the database fails, is closed or was opened before a fork, if the function given to
-            the method `commit_if` returns False, and in place of a ValueError, TypeError,
-            OverflowError or OSError that `add_rows` raised; dengine's own errors and all others
-            pass unchanged. After an error nothing is written, with two exceptions: if the SQLite
-            file was replaced meanwhile, the old file may have the rows; and if the connection to a
-            server broke during the commit, the server may have them.
+            the method `commit_if` returns False (the caller has given up), and in place of a
+            ValueError, TypeError, OverflowError or OSError that `add_rows` raised; dengine's own
+            errors and all others pass unchanged. After an error nothing is written, with two
+            exceptions: if the SQLite file was replaced meanwhile, the old file may have the rows;
+            and if the connection to a server broke during the commit, the server may have them.
         """
         self.check_open()
         self.before_use()  # before the lock is taken: it may write
@@ -637,7 +640,8 @@ class Database:
 
         If another thread is writing: with `waiting` this waits until it has finished; without, it
         returns at once, and that thread disconnects when it has finished. SQLite in memory is lost.
-        Records that wait in the outbox are not written. A second call changes nothing.
+        What the engine has recorded but not written yet is not written. A second call changes
+        nothing.
         """
         self._closed = True
         if self._writing.acquire(blocking=waiting):
@@ -666,8 +670,9 @@ class Database:
             In a write transaction.
         column : sqlalchemy.Column
             The table's column that takes the numbers. Decisions and events continue the numbers of
-            the cell; labels, versions and corrections those of its product, if it has one, which is
-            then locked until the transaction ends.
+            the cell. Labels, model versions and corrections of labels continue those of all cells
+            of its product (which share them), if it has one; the product is then locked until the
+            transaction ends.
         rows : sequence of mapping
             Without `cell_id`. They are not changed.
 
@@ -690,11 +695,11 @@ class Database:
     def rows_by_id(
         self, connection: sa.Connection, query: sa.Select[Any], ids: Sequence[str]
     ) -> dict[str, Any]:
-        """Run a query over decisions for the given ids of this robot cell, at most CHUNK (500) at a
-        time.
+        """Run a query over decisions for the given ids of this robot cell; return the rows by id.
 
         `query` selects from the table `decision`, its column `id` included, and is limited to this
-        cell here. Return the rows by id; ids without a row are left out. Without ids no query runs.
+        cell here. It runs once for each CHUNK (500) ids, and not at all without ids. Ids without a
+        row are left out.
         """
         query = query.where(self.own(DECISION))
         return {

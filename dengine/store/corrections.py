@@ -45,19 +45,22 @@ class CorrectionTable(CellTable):
     def apply(self, change: Change) -> int:
         """Commit a person's change and its event in one transaction; return the event's number.
 
-        The change may correct labels, or have them forgotten (they count nowhere any more), store a
-        model version, and replace the engine's settings. An accepted version deletes the stored
-        arrays of older versions that are not kept any more. If one of these fails, nothing is
-        written. A label that already has the new value gets a correction, too. An id that is given
-        twice gets one correction. If nothing is to be changed, only the event is committed.
+        The change may correct labels, or withdraw them (they are then forgotten, and count
+        nowhere), store a model version, and replace the engine's settings. A correction is a row of
+        its own; the label stays as it was reported. If the version is to be put in force (it is
+        accepted), the stored arrays of older versions that are not kept any more are deleted. If
+        anything fails, nothing is written. A label that already has the new value gets a
+        correction, too. An id that is given twice gets one correction. If nothing is to be changed,
+        only the event is committed.
 
         Raises
         ------
         ReportError
             For a decision that is unknown or has no label.
         SettingError
-            If the settings of another robot cell of the product contradict the new ones, or the
-            recipe of either cannot be read.
+            If the new settings contradict those of another robot cell of the product (the cells
+            share labels and models), or the recipe in either (how the model is made) cannot be
+            read.
         StoreError
             For data of the event that JSON does not have, for a setting that only the store itself
             may write (`schema.RESERVED`), for an accepted version without arrays, for an array of
@@ -90,8 +93,8 @@ class CorrectionTable(CellTable):
     ) -> dict[str, bool | None]:
         """Return the label of each of these decisions, by id, as corrected by now.
 
-        It is True for success, False for failure, and None if it was forgotten. Raise ReportError
-        for a decision that is not this cell's, is unknown, or has no label.
+        It is True for success, False for failure, and None if a person withdrew it. Raise
+        ReportError for a decision that is not this cell's, is unknown, or has no label.
         """
         stored = self.stored_labels(connection, ids)
         values = {0: False, 1: True, FORGOTTEN: None}
@@ -113,6 +116,8 @@ class CorrectionTable(CellTable):
     def after(self, after: int = 0) -> list[Correction]:
         """Return corrections of labels, oldest first; a label that was corrected twice has two.
 
+        A correction changes or withdraws a label, and is a row of its own.
+
         Parameters
         ----------
         after : int, default 0
@@ -121,8 +126,8 @@ class CorrectionTable(CellTable):
         Returns
         -------
         list of Correction
-            Of the robot cell, or of all cells of its product; each with the number of the label, as
-            `seq`.
+            Of the robot cell, or of all cells of its product (which share labels); each with the
+            number of the label, as `seq`.
 
         Raises
         ------
@@ -148,8 +153,9 @@ class CorrectionTable(CellTable):
     ) -> int:
         """Insert an event, and a correction for each decision in `labels`; nothing is committed.
 
-        The labels themselves stay as they were reported. Without labels only the event is inserted.
-        With labels the cell's product is locked until the transaction ends.
+        A correction is a row that changes or withdraws a label, which itself stays as it was
+        reported. Without labels only the event is inserted. With labels the cell's product (the
+        cells with which it shares labels), if it has one, is locked until the transaction ends.
 
         Parameters
         ----------
@@ -158,9 +164,9 @@ class CorrectionTable(CellTable):
         event : Event
             What happened; the corrections have its author and time, too.
         success : bool or None
-            The new label of all decisions; None: forgotten.
+            The new label of all decisions; None: the labels are withdrawn.
         labels : mapping of str to bool or None
-            Label until now of each decision, by id; None if it was forgotten.
+            Label until now of each decision, by id; None if it was withdrawn before.
 
         Returns
         -------
@@ -182,10 +188,11 @@ class CorrectionTable(CellTable):
     def stored_labels(self, connection: sa.Connection, ids: Sequence[str]) -> dict[str, Any]:
         """Return, by id, a row for each of the given decisions that the robot cell has stored.
 
-        A row has content_hash, quarantined (whether its trace is kept out of training) and time of
-        the decision, and of its label success and source as they were reported, its number `seq`,
-        and `corrected`, the label after corrections: 0, 1 or FORGOTTEN (2). These four are None
-        without a label. Ids that are not stored are left out.
+        Of the decision a row has id, content_hash (a hash of the trace, or of the part's number),
+        quarantined (whether its trace is kept out of training) and time. Of its label it has
+        success and source as they were reported, its number `seq`, and `corrected`, the label after
+        corrections: 0, 1, or FORGOTTEN (2) if a person withdrew it. These four are None without a
+        label. Ids that are not stored are left out.
         """
         query = sa.select(
             *DECISION.c["id", "content_hash", "quarantined", "time"],

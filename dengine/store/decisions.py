@@ -45,8 +45,9 @@ class DecisionTable(CellTable):
         Returns
         -------
         StoredDecision or None
-            None for an unknown id, also for the id of another cell's decision. If a confirmation
-            was corrected to bad, the source is `Source.STOP`.
+            None for an unknown id, also for the id of another cell's decision. If the part was
+            confirmed as good without a check, and its label was corrected to bad, the label's
+            source is `Source.STOP`.
 
         Raises
         ------
@@ -95,8 +96,9 @@ class DecisionTable(CellTable):
         Parameters
         ----------
         where : HistoryFilter
-            The selection: a decision must have the values of all fields that are not None, and its
-            time must lie from `since` to before `until`.
+            The selection: a decision must have the values of all fields that are not None (action,
+            predicted action, reason, label, part), and its time must lie from `since` to before
+            `until`.
         limit : int
             Number of decisions at most.
         start_after : str or None
@@ -146,13 +148,13 @@ class DecisionTable(CellTable):
         Parameters
         ----------
         since_version : int, default 0
-            Only decisions by this version or a later one.
+            Only decisions by this model version or a later one.
 
         Returns
         -------
         list of str
             Decisions on quarantined traces (stored, but never used in training) are left out. A
-            decision whose label was forgotten has a label.
+            label that a person withdrew counts as a label here.
         """
         return [
             row.id
@@ -169,13 +171,13 @@ class DecisionTable(CellTable):
         Parameters
         ----------
         since_version : int, default 0
-            Only decisions by this version or a later one.
+            Only decisions by this model version or a later one.
 
         Returns
         -------
         list of StoredDecision
             Without their traces. Decisions on quarantined traces (stored, but never used in
-            training) are left out. A decision whose label was forgotten has a label.
+            training) are left out. A label that a person withdrew counts as a label here.
         """
         return [
             read_decision(row)
@@ -187,8 +189,9 @@ class DecisionTable(CellTable):
     ) -> sa.Select[Any]:
         """Return the query for the cell's decisions of an action that have no label, oldest first.
 
-        A forgotten label is a label here. Decisions on quarantined traces, and by a version before
-        `since_version`, are left out.
+        A forgotten label (which a person withdrew) is a label here. Decisions on quarantined traces
+        (stored, but never used in training), and by a model version before `since_version`, are
+        left out. `columns` are those that the query selects.
         """
         return (
             sa.select(*columns)
@@ -206,12 +209,12 @@ class DecisionTable(CellTable):
     def overdue_to(self, within: int, since_version: int = 0) -> int:
         """Return the number up to which decisions are old enough for their checks to be overdue.
 
-        Decisions are numbered 1, 2, ... in each robot cell. A check is overdue if its decision has
-        this or a lower number, asked for the check, and has no label. The number returned is the
-        larger of two: the number of the newest decision minus `within`, and the largest
-        `overdue_to` that is stored with a label, which is this number at the time when the decision
-        rule was updated with the label; so a check that was overdue then stays so, whatever
-        `within` is. It is 0 if nothing can be overdue yet.
+        Decisions are numbered 1, 2, ... in each robot cell. A check is overdue if a decision with
+        this or a lower number asked for it and has no label. The number returned is the larger of
+        two. One is the number of the newest decision minus `within`. The other is the largest such
+        number that is stored with a label: with each label the number is stored that was valid when
+        the decision rule learned it. So a check that was overdue then stays so, whatever `within`
+        is now. The result is 0 if nothing can be overdue yet.
 
         Parameters
         ----------
@@ -219,7 +222,7 @@ class DecisionTable(CellTable):
             A check is overdue once so many or more decisions have followed its own.
         since_version : int, default 0
             The model version with which `within` came into force. If the newest decision is by an
-            earlier version, or there is none, only the numbers of the labels count.
+            earlier version, or there is none, only the numbers that are stored with labels count.
 
         Returns
         -------
@@ -243,15 +246,17 @@ class DecisionTable(CellTable):
         """Count the cell's decisions in groups.
 
         The decisions of a group are equal in action, in the action that the model alone would have
-        taken, reason, audit, quarantine, corrected label, the label's source, and whether they
-        are so old that a check without a label would be overdue (whatever their action).
+        taken, in the reason, in whether the part was audited (checked at random although the model
+        was certain), in whether the trace is quarantined (never used in training), in the corrected
+        label and its source, and in whether they are so old that a check without a label would be
+        overdue (whatever their action).
 
         Parameters
         ----------
         last : int or None
             Number of newest decisions that are counted; None: all.
         since_version : int, default 0
-            Only those of them by this version or a later one.
+            Only those of them by this model version or a later one.
         within : int or None
             A check without a label is overdue once so many or more decisions have followed its own;
             None: none is.
@@ -311,8 +316,10 @@ class DecisionTable(CellTable):
         Returns
         -------
         list of Stretch
-            Sorted by their newest decision; [] without decisions. Bad accepted parts are counted by
-            their labels after corrections.
+            Sorted by their newest decision; [] without decisions. Each has the number of decisions,
+            the time of the newest, and how many of them are verified, verified because the trace is
+            novel, accepted, accepted but bad by the label after corrections, rejected by the model,
+            and decided by an operator's limits.
         """
         if seconds:
             stretch: sa.ColumnElement[Any] = sa.func.floor((DECISION.c.time - start) / seconds)
@@ -344,18 +351,18 @@ class DecisionTable(CellTable):
         Parameters
         ----------
         tally : Tally or None
-            What `tally`, over all decisions, returned, if it was called already; None: it is called
-            here.
+            What the method `tally` returned over all decisions, if it was called already; None: it
+            is called here.
 
         Returns
         -------
         dict
-            decisions, labels: numbers; quarantined: number of decisions whose trace is kept out of
-            training; corrected: number of decisions whose label was ever corrected or forgotten,
-            and is not forgotten now; forgotten: number of those whose label is forgotten now;
-            actions, reasons: numbers of decisions by value, and sources: numbers of labels by
-            value, each a dict that includes values with 0. Forgotten labels are not among labels
-            and sources.
+            decisions, labels: their numbers, without labels that are forgotten (withdrawn by a
+            person); quarantined: number of decisions whose trace is kept out of training;
+            corrected: number of decisions whose label was ever corrected or forgotten, and is not
+            forgotten now; forgotten: number of those whose label is forgotten now; actions,
+            reasons: numbers of decisions for each action and reason; sources: numbers of labels for
+            each source, without forgotten ones. These three are dicts that include values with 0.
         """
         tally = tally or self.tally()
         actions = tally.by("action")

@@ -88,10 +88,11 @@ class Drainer:
     def fault(self) -> str:
         """Why the store cannot be written or read at present; "" if it can.
 
-        The first of these is given: why the journal cannot be written; the last error of the
-        copying to the database or timeout of `drain`, until the copying succeeds again; that the
-        oldest record has waited for the database longer than `limit` (the seconds that a call waits
-        at most) and than LAG_SECONDS (1 s).
+        Records are written to the journal, a local file, and copied from there to the database. The
+        first of these is given: why the journal cannot be written; the last error of the copying or
+        timeout of `drain`, until the copying succeeds again; that the oldest record has waited for
+        the database longer than `limit` (the seconds that a call waits at most) and than
+        LAG_SECONDS (1 s).
         """
         fault = self._recorder.fault or self._error
         lag = self.lag
@@ -113,9 +114,9 @@ class Drainer:
 
         If the database has everything, nothing is done. Raise StoreError if this takes longer than
         `seconds` (None: `limit`), or as soon as there is a `fault`, which is a reason why the store
-        cannot be used now; the copying is requested even so. The records then stay in the journal,
-        or in memory if the disk fails, and are copied later. After a timeout there is a `fault`
-        until the database takes records again.
+        cannot be used now; the copying is requested even so. The records then stay in the journal
+        (a local file), or in memory if the disk fails, and are copied later. After a timeout there
+        is a `fault` until the database takes records again.
         """
         limit = self._limit if seconds is None else seconds
         with self._changed:
@@ -140,12 +141,13 @@ class Drainer:
     def pop_label_numbers(self) -> LabelNumbers:
         """Return (decision id, label number) of each label that was drained since the last call.
 
-        To drain a label is to copy it from the journal to the database. The pairs are in the order
-        in which this was done. A report that repeats a stored label has the number of that label. A
-        late stop (a line stop of a part that was confirmed as good before) has the number of the
-        label that it corrects. There is no pair for a dead letter (a label that the database did
-        not take, and that became an event), or for a label that an earlier process left in the
-        journal. Without a product (robot cells that share labels and versions) the list is empty.
+        To drain a label is to copy it from the journal, a local file, to the database. Labels are
+        numbered in the database. The pairs are in the order in which the labels were drained. A
+        report that repeats a stored label has the number of that label. A late stop (a report that
+        an accepted part was bad, after it had counted as good) has the number of the label that it
+        corrects. There is no pair for a dead letter (a label that the database did not take, and
+        that became an event), or for a label that an earlier process left in the journal. Without a
+        product (robot cells that share labels and versions) the list is empty.
         """
         with self._changed:
             numbers = self._label_numbers
@@ -156,8 +158,8 @@ class Drainer:
         """Have this object's thread, which uses the database, make a call; do not wait for it.
 
         The calls are made one after another, in their order. Before a call, the thread copies the
-        records that are on the journal's disk to the database. If this fails, the call is made
-        nevertheless.
+        records that are on disk in the journal (a local file) to the database. If this fails, the
+        call is made nevertheless.
 
         Returns
         -------
@@ -208,9 +210,9 @@ class Drainer:
     def stop(self, seconds: float) -> bool:
         """End the thread, wait for it, and return whether it ended within these seconds.
 
-        Before it ends, the thread copies the records that are on the journal's disk to the
-        database, unless the database fails, and makes the calls that were submitted. If it does
-        not end in time, it goes on. It must have been started.
+        Before it ends, the thread copies the records that are on disk in the journal (a local file)
+        to the database, unless the database fails, and makes the calls that were submitted. If it
+        does not end in time, it goes on. It must have been started.
         """
         with self._changed:
             self._stopped = True
@@ -230,14 +232,16 @@ class Drainer:
                 self.drain()
 
     def _run(self) -> None:
-        """Copy the records on the journal's disk to the database, and make submitted calls.
+        """Copy the records that are on disk in the journal to the database; make submitted calls.
+
+        The journal is a local file that gets each record first.
 
         The thread runs this until `stop` is called. Before a call all of these records are copied;
-        if this fails, the call is made nevertheless. Any error of the copying is kept for `fault`,
-        until it succeeds again. It is logged only if neither an earlier error nor a timeout of
-        `drain` is kept there. The database is tried again about a second later, or sooner if there
-        is a call. Once stopped, the thread ends when all submitted calls are made, and the records
-        are copied or the copying has failed.
+        if this fails, the call is made nevertheless. Any error of the copying is kept for `fault`
+        (why the store cannot be used now), until it succeeds again. It is logged only if neither an
+        earlier error nor a timeout of `drain` is kept there. The database is tried again about a
+        second later, or sooner if there is a call. Once stopped, the thread ends when all submitted
+        calls are made, and the records are copied or the copying has failed.
         """
         while True:
             call = self._wait_for_work()
@@ -257,10 +261,10 @@ class Drainer:
     def _wait_for_work(self) -> tuple[Future[Any], Callable[[], Any]] | None:
         """Wait until there is a call, `stop` was called, or it is time to drain records.
 
-        To drain records is to copy them to the database. Return the oldest submitted call, which
-        leaves the queue, or None if there is none. Records are drained DRAIN_SECONDS (0.25 s) after
-        the first of them came, or at once if somebody waits for the database, the journal is so
-        long that it is to be cleared, or `stop` was called.
+        To drain records is to copy them from the journal, a local file, to the database. Return the
+        oldest submitted call, which leaves the queue, or None if there is none. Records are drained
+        DRAIN_SECONDS (0.25 s) after the first of them came, or at once if somebody waits for the
+        database, the journal is so long that it is to be cleared, or `stop` was called.
         """
         with self._changed:
             self._changed.wait_for(lambda: self._calls or self._recorder.synced or self._stopped)
@@ -278,7 +282,8 @@ class Drainer:
     def _note_error(self, error: Exception) -> None:
         """Keep an error of the copying to the database for `fault`, and wake those who wait.
 
-        It is logged only if neither an earlier error nor a timeout of `drain` is kept there.
+        `fault` says why the store cannot be used now. The error is logged only if neither an
+        earlier error nor a timeout of `drain` is kept there.
         """
         with self._changed:
             if not self._error:
@@ -287,7 +292,7 @@ class Drainer:
             self._changed.notify_all()
 
     def _drain_synced(self) -> None:
-        """Copy all records that are on the journal's disk by now to the database.
+        """Copy all records that are now on disk in the journal (a local file) to the database.
 
         They go in chunks of at most CHUNK (500) records, see `_drain_chunk`. A decision that a
         later record replaces is left out. Later records go with them only if they still fit into
@@ -304,19 +309,22 @@ class Drainer:
         self._error = ""
 
     def _drain_chunk(self) -> None:
-        """Commit the oldest records that are on the journal's disk, at most CHUNK (500).
+        """Commit the oldest records that are on disk in the journal, at most CHUNK (500).
 
-        There must be one. A decision is left out if a later record with the same id replaces it. A
-        record that contradicts the store, or that the database refuses, becomes a dead letter
-        (`SqlStore.apply_records`) and counts as drained. The records are committed as they are in
-        memory; that some of them are damaged on disk, or cannot be read there, is noted by an
-        event, which is also logged. Then the journal's header notes that the database has the
-        records (if it cannot be written, that is ignored), `n_drained` counts them, and they leave
-        the queue of the recorder and, except for the newest decisions, the `DecisionIndex`, by
-        which decisions are found in memory. In a product (robot cells that share labels and
-        versions) the numbers of their labels are kept for `pop_label_numbers`. Raise StoreError if
-        the database fails; nothing of this is done then, and the next call commits the same records
-        again, of which some may be stored already.
+        The journal is a local file that gets each record (decision, label or event) first; at least
+        one must wait there. A decision is left out if a later record with the same id replaces it.
+        In place of a record that contradicts the store, or that the database refuses, an event is
+        stored (a dead letter), and the record counts as drained (copied). The records are committed
+        as they are in memory; that some of them are damaged on disk, or cannot be read there, is
+        noted by an event, which is also logged.
+
+        Then the journal's header notes that the database has the records (if it cannot be written,
+        that is ignored), `n_drained` counts them, and they leave the queue of the recorder and,
+        except for the newest decisions, the `DecisionIndex`, by which decisions are found in
+        memory. In a product (robot cells that share labels and versions) the numbers of their
+        labels are kept for `pop_label_numbers`. Raise StoreError if the database fails; nothing of
+        this is done then, and the next call commits the same records again, of which some may be
+        stored already.
         """
         with self._changed:
             chunk = list(islice(self._recorder.synced, CHUNK))

@@ -32,7 +32,8 @@ class EventTable(CellTable):
     ) -> int:
         """Commit an event with the present time, and return its number.
 
-        In `kind`, `text` and `author` a NUL and half a surrogate pair become escapes.
+        An event is a row of the store's log: what happened besides decisions and labels. In `kind`,
+        `text` and `author` a NUL and half a surrogate pair become escapes.
 
         Parameters
         ----------
@@ -61,8 +62,7 @@ class EventTable(CellTable):
         return number
 
     def record_damage(self, text: str) -> None:
-        """Commit an event of kind "damaged" with this text, unless the robot cell has the same
-        already.
+        """Commit an event of kind "damaged" with this text, unless the cell has the same already.
 
         If the store cannot be written, the text is logged instead, and nothing is raised. Raise
         StoreError if it cannot be read.

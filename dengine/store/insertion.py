@@ -44,19 +44,24 @@ class RecordInsertion:
         self._corrections = corrections
 
     def commit(self, records: Sequence[Record]) -> LabelNumbers:
-        """Commit records in one transaction; return (decision id, label number) of their labels.
+        """Commit records (decisions, labels, events); return the numbers of their labels.
 
-        A record that is stored already changes nothing, except that a label has its pair. A record
-        that contradicts the store, like another label of a labelled decision, or a label whose
-        decision is not stored, becomes a dead letter: an event that names it and says why (its
-        trace and other values are not in it), and that is logged. A late stop, which is a line stop
-        of a part that had counted as good, corrects the label of its part to failure, with an
-        event, and has its pair. A late stop of a forgotten label, which a person has taken out of
-        use, is a dead letter; if the label counts as a failure already, the late stop changes
-        nothing. A label of a quarantined trace is quarantined (kept out of training). If the
-        database refuses a value, the records are halved, each half in a transaction of its own,
-        until the refused record is alone; it becomes a dead letter, too. A label that became a dead
-        letter has no pair. Raise StoreError if the database fails in another way; halves that were
+        The result is a list of pairs (decision id, label number), also for labels that are stored
+        already; apart from that, a record that is stored already changes nothing. In place of a
+        record that contradicts the store, like another label of a labelled decision, or a label
+        whose decision is not stored, a dead letter is stored: an event that names the record and
+        says why (its trace and other values are not in it), and that is logged. A label that became
+        a dead letter has no pair. A label of a quarantined trace is quarantined, too (kept out of
+        training).
+
+        A late stop is a report that an accepted part was bad, after the part had counted as good.
+        It corrects the label of the part to failure, with an event, and has a pair with the number
+        of this label; if the label counts as a failure already, it changes nothing. If a person has
+        withdrawn the label, the late stop becomes a dead letter.
+
+        The records are committed in one transaction. But if the database refuses a value, they are
+        halved, each half in a transaction of its own, until the refused record is alone; it becomes
+        a dead letter, too. Raise StoreError if the database fails in another way; halves that were
         committed before stay.
         """
         try:
@@ -74,17 +79,19 @@ class RecordInsertion:
     def _insert(self, connection: sa.Connection, records: Sequence[Record]) -> LabelNumbers:
         """Insert the records that are not stored yet; nothing is committed.
 
-        The first label of a decision is inserted. A second one that repeats success and source of
-        the first changes nothing. A record that contradicts the store, or a label whose decision is
-        not stored, becomes an event, "dead letter", which is also logged as an error. No two
-        decisions among the records may have one id. A line stop of a part that had counted as good
-        (`_is_late_stop`) corrects the label of that part, with an event, unless it is a failure
-        already; if a person has taken the label out of use (forgotten), the line stop becomes a
-        dead letter. Return one pair (decision id, number) for each decision that has a label among
-        the records, unless that becomes a dead letter: the number of its first label, whether that
-        is new, was stored before, or is corrected by a late stop. A new label keeps its number if
-        all stored numbers are smaller, and otherwise gets the next one (`Database.insert`). It is
-        quarantined (kept out of training) if its decision is.
+        Records are decisions, labels and events; no two decisions among them may have one id. The
+        first label of a decision is inserted. A second one that repeats success and source of the
+        first changes nothing. In place of a record that contradicts the store, or of a label whose
+        decision is not stored, an event is stored, a "dead letter", which is also logged as an
+        error. A late stop (a report that an accepted part was bad, after it had counted as good)
+        corrects the label of that part, with an event, unless it is a failure already; if a person
+        has withdrawn the label, the late stop becomes a dead letter. A new label keeps its number
+        if all stored numbers are smaller, and otherwise gets the next one (`Database.insert`). It
+        is quarantined (kept out of training) if its decision is.
+
+        Return one pair (decision id, number) for each decision that has a label among the records,
+        unless that becomes a dead letter: the number of its first label, whether that is new, was
+        stored before, or is corrected by a late stop.
         """
         events = [record for record in records if isinstance(record, Event)]
         decisions = [record for record in records if isinstance(record, StoredDecision)]
@@ -127,10 +134,10 @@ class RecordInsertion:
     ) -> list[str]:
         """Insert the decisions that are not stored yet, with their traces; nothing is committed.
 
-        Return a text for each decision whose id is stored with other values, in columns or trace. A
-        decision that is stored with the same values is passed over. The stored values are not
-        changed. No two of the decisions may have one id. New ones get the next numbers of the robot
-        cell, in their order; their attribute `number` is not used.
+        Return a text, which names the difference, for each decision whose id is stored with other
+        values, in columns or trace. A decision that is stored with the same values is passed over.
+        The stored values are not changed. No two of the decisions may have one id. New ones get the
+        next numbers of the robot cell, in their order; their attribute `number` is not used.
         """
         query = sa.select(*DECISION.c, *TRACE.c["decision_id", "channels", "samples", "data"])
         stored = self._database.rows_by_id(
@@ -160,8 +167,10 @@ class RecordInsertion:
     ) -> None:
         """Insert events, and one "dead letter" for each problem, which is also logged as an error.
 
-        An event is left out if the robot cell has stored one with the same time, kind and text. A
-        "dead letter" gets the present time and is always inserted. Nothing is committed.
+        A problem is a text that says why a record cannot be stored; a "dead letter" is the event
+        that is stored in its place. An event is left out if the robot cell has stored one with the
+        same time, kind and text. A "dead letter" gets the present time and is always inserted.
+        Nothing is committed.
         """
         new = []
         if events:
@@ -176,7 +185,7 @@ class RecordInsertion:
         self._database.insert(connection, EVENT.c.number, [to_row(event) for event in new])
 
     def _correct_confirmation(self, connection: sa.Connection, decision_id: str) -> None:
-        """Correct a label to failure: the part had counted as good, and its line stop came later.
+        """Correct a label to failure: the part had counted as good, and stopped the line later.
 
         An event "late stop" is inserted with the correction; nothing is committed.
         """
@@ -193,10 +202,10 @@ def _find_problem(label: NewLabel, row: Any, first: Any) -> str:
     """Return in words why the store cannot take a label; "" if it can.
 
     `row` is the stored row of its decision, or None. `first` is the label that the decision has, or
-    None; it is this row or a `NewLabel`. The row must be there, with the content hash and the time
-    that the label has of its decision. A second label is a problem, with two exceptions: it repeats
-    the first, or it is a late stop, a line stop of a part that was confirmed as good before. A late
-    stop is a problem if a person had the first label forgotten.
+    None; it is this row or a `NewLabel`. It is a problem if there is no row, or if its content hash
+    or time is not that which the label names for its decision. A second label is a problem, unless
+    it repeats the first, or is a late stop (it says that an accepted part was bad, after it had
+    counted as good). A late stop is a problem if a person has withdrawn the first label.
     """
     if row is None:
         return f"{_describe(label)}, which the store does not hold"
@@ -228,9 +237,10 @@ def _differences(item: StoredDecision, row: Any) -> list[str]:
 
 
 def _describe(record: Record) -> str:
-    """Return in a few words what a record is, for the text of a dead letter.
+    """Return in a few words what a record is, for the text of an event about it.
 
-    They name a decision or a label by the decision's id, and an event by its text.
+    The event ("dead letter") says that the record could not be stored. The words name a decision or
+    a label by the decision's id, and an event by its text.
     """
     if isinstance(record, Event):
         return f"an event, {record.text!r}"

@@ -273,11 +273,12 @@ class Journal:
     def undrained_records(self) -> Iterator[tuple[int, int, bytes]]:
         """Yield (offset, end, encoded record) of the records from `drained_to` on, oldest first.
 
-        The store lacks them; but if the header is older than the store, as after a crash, it has
-        some of them. A record takes the bytes of the file from `offset` to before `end`. Damaged
-        records are skipped: the search goes on at the next mark (`MARK`, four bytes with which each
-        record begins), and the digest that chains a record to the one before is not checked. Raise
-        OSError, and no StoreError, if the disk cannot be read.
+        `drained_to` is the offset up to which the store has taken the records, so it lacks the
+        others; but if the journal's header, in which this offset is kept, is older than the store,
+        as after a crash, the store has some of them. A record takes the bytes of the file from
+        `offset` to before `end`. Damaged records are skipped: the search goes on at the next mark
+        (`MARK`, four bytes with which each record begins), and the digest that chains a record to
+        the one before is not checked. Raise OSError, and no StoreError, if the disk cannot be read.
         """
         begin = self.drained_to
         while begin < self.end:
@@ -294,13 +295,13 @@ class Journal:
             begin += 1 + (mark if mark >= 0 else len(block) - len(MARK))
 
     def decode_undrained(self) -> Iterator[Record]:
-        """Yield the records that the store lacks, oldest first, without those that are replaced.
+        """Yield the records that the store lacks, oldest first, without replaced decisions.
 
-        If several decisions have one id, the last replaces the others. Damaged records are left
-        out; the attribute `loss` says so. The file is read twice, so that it need not fit into
-        memory. Raise StoreError, before the first record is yielded, for an intact record that
-        cannot be decoded, like that of another release of dengine, and OSError if the disk cannot
-        be read.
+        Records are decisions, labels and events. If several decisions have one id, the last
+        replaces the others. Damaged records are left out; the attribute `loss` says so. The file is
+        read twice, so that it need not fit into memory. Raise StoreError, before the first record
+        is yielded, for an intact record that cannot be decoded, like that of another release of
+        dengine, and OSError if the disk cannot be read.
         """
         newest: dict[str, int] = {}  # where the newest decision of an id stands
         for offset, _, blob in self.undrained_records():
@@ -319,11 +320,11 @@ class Journal:
     def save_newest_entry(self, newest: EntryName | None) -> None:
         """Write to header and head the newest ledger entry, and which records the store holds.
 
-        The header is the beginning of the journal, the head a small file beside it. `newest` is
-        number and digest of the ledger entry; None: there is none yet. Nothing is synced: an older
-        header is harmless, since the store ignores a record that it is given twice. The attribute
-        `head` keeps the entry, also if it cannot be written. Raise StoreError if the header cannot
-        be written; a failure of the head is ignored.
+        The header is the beginning of the journal, the head a small file beside it. The ledger is
+        the store's hash chain, and `newest` is number and digest of its newest entry; None: there
+        is none yet. Nothing is synced: an older header is harmless, since the store ignores a
+        record that it is given twice. The attribute `head` keeps the entry, also if it cannot be
+        written. Raise StoreError if the header cannot be written; a failure of the head is ignored.
         """
         with self._describing, _os_errors(self.path):
             self.head.newest = newest
@@ -333,9 +334,10 @@ class Journal:
     def _write_head(self) -> None:
         """Write the attribute `head` to the small file beside the journal, without a sync.
 
-        It names the newest ledger entry, the last record that the store holds and the newest synced
-        one (`Head`). The file is created if need be. A failure is ignored: an older head is
-        harmless. The caller holds the lock `_describing`.
+        It names the newest entry of the ledger (the store's hash chain), the last record that the
+        store holds and the newest one that is synced in the journal (`Head`). The file is created
+        if need be. A failure is ignored: an older head is harmless. The caller holds the lock
+        `_describing`.
         """
         with suppress(OSError):
             descriptor = open_plain(head_path(self.path), os.O_WRONLY | os.O_CREAT)
@@ -345,11 +347,11 @@ class Journal:
     def clear(self) -> None:
         """Remove all records; the caller has made sure that the store holds them.
 
-        The file is synced first: after a power failure it might otherwise be cut off, but have an
-        older header, by which the store lacks records. It is cut off behind its header, which is
-        written anew and says that the store holds all. Then space is reserved (`reserve`; none on a
-        full disk) and synced. The head file is not written. Raise StoreError if the file cannot be
-        written.
+        The file is synced first, or a power failure might leave it cut off, but with an older
+        header, which says that the store lacks records. It is cut off behind its header, which is
+        written anew and says that the store holds all. Then disk space is reserved for new records
+        (`reserve`; none on a full disk) and synced. The head, the small file beside the journal, is
+        not written. Raise StoreError if the file cannot be written.
         """
         self.reserve()  # syncs, so that no disk keeps the cut without the header
         with self._describing, _os_errors(self.path):
@@ -372,9 +374,10 @@ class Journal:
         """Create a new file at the path of a journal that was deleted, moved or replaced.
 
         The records that the store lacks are copied to the same offsets from the lost file, which is
-        still open and is then closed. A file that is at the path by now is taken, and written over.
-        Raise StoreError if it cannot be written, or another engine has locked it, or the lost file
-        cannot be read; the journal then still uses the lost one.
+        still open and is then closed. If another file is at the path by now, it is used: its header
+        and the bytes at these offsets are written over. Raise StoreError if it cannot be written,
+        or another engine has locked it, or the lost file cannot be read; the journal then still
+        uses the lost one.
         """
         lost = self._file
         self._file = _open_file(self.path)
@@ -391,13 +394,13 @@ class Journal:
             lost.close()
 
     def close(self, waiting: bool = True) -> None:
-        """Cut off the reserved space, and the records if the store has all; close, unlock the file.
+        """Cut off the reserved space, and the records if the store has all; close and unlock it.
 
         With `waiting=False` the file is not synced, and the records stay even if the store has all.
 
-        The header stays in the file, so that the next engine can compare it with the ledger. A
-        journal that was opened for reading is only closed, and so is a journal whose disk fails:
-        nothing is raised. A second call does nothing.
+        The header stays in the file, so that the next engine can compare it with the ledger (the
+        store's hash chain). A journal that was opened for reading is only closed, and so is a
+        journal whose disk fails: nothing is raised. A second call does nothing.
         """
         if self._owning and not self._file.closed:
             with suppress(OSError):
@@ -411,8 +414,9 @@ class Journal:
         """Write the header, the first 256 bytes: the text MAGIC, then JSON, padded with zeros.
 
         The JSON has this process as the owner, the number of the records that the store has, the
-        offset behind them, the newest ledger entry, and a CRC-32 of these fields. Nothing is
-        synced. Raise OSError if it cannot be written.
+        offset behind them, number and digest of the newest entry of the ledger (the store's hash
+        chain), and a CRC-32 of these fields. Nothing is synced. Raise OSError if it cannot be
+        written.
         """
         fields = {
             "owner": describe_process()[:60],
@@ -433,11 +437,12 @@ class Journal:
     def _scan(self) -> None:
         """Read the header and all records that the store lacks; set the journal's attributes.
 
-        The records are compared with `head`, which was read before. With a damaged header the store
-        counts as lacking every record, and `head` is not compared. A damaged header, and records
-        that are damaged or missing, are described in `loss`, and not raised. An unfinished record
-        at the end is left out. Nothing is written. Raise StoreError if the file is no journal, and
-        OSError if it cannot be read. An empty file is a journal without records.
+        The attribute `head`, read before from the small file beside the journal, names the newest
+        record that was synced; if this is not found, records are missing. With a damaged header the
+        store counts as lacking every record, and `head` is not compared. A damaged header, and
+        records that are damaged or missing, are described in `loss`, and not raised. An unfinished
+        record at the end is left out. Nothing is written. Raise StoreError if the file is no
+        journal, and OSError if it cannot be read. An empty file is a journal without records.
         """
         head = self.head
         fields: Fields = {"newest": None, "n_drained": head.n_drained}
@@ -512,7 +517,7 @@ def _chain_digest(previous: bytes, record: bytes) -> bytes:
 
 
 def _os_errors(path: Path, owning: bool = True) -> AbstractContextManager[None]:
-    """Context manager that raises StoreError, with the path and advice, for an OSError in it.
+    """Return a context manager that raises StoreError for an OSError, with path and advice.
 
     The advice is about writing the journal, or if `owning` is False about reading it.
     """
@@ -556,10 +561,11 @@ def journal_path(url: Any, cell_id: str) -> Path:
     Returns
     -------
     Path
-        Beside an SQLite file, links resolved, STORE.CELL.journal. For a server CELL.DIGEST.journal
-        in the folder dengine of the user's state folder (`XDG_STATE_HOME`, or ~/.local/state), with
-        the first 60 characters of the escaped robot cell, and 12 hexadecimal digits of a digest of
-        the server with its port, the database and the cell.
+        For an SQLite file STORE.CELL.journal beside it: its name, links resolved, and the escaped
+        `cell_id`. For a server CELL.DIGEST.journal in the folder dengine of the user's state folder
+        (`XDG_STATE_HOME`, or ~/.local/state), with the first 60 characters of the escaped
+        `cell_id`, and 12 hexadecimal digits of a digest of the server with its port, the database
+        and `cell_id`.
     """
     name = urllib.parse.quote(cell_id, safe="")
     if IGNORES_CASE:  # or cell A and cell a would have one journal
@@ -589,11 +595,12 @@ def head_path(journal: Path) -> Path:
 def read_undrained(path: Path) -> tuple[list[Record], Journal]:
     """Return the records of a journal that its store has not taken, and the journal, closed.
 
-    The records are those of `Journal.decode_undrained`; the journal's attribute `loss` says which
-    are missing or damaged. Nothing is locked or changed, so an engine may be using the journal.
-    Raise StoreError if the file cannot be opened or is no journal, and for an intact record that
-    cannot be decoded, like that of another release of dengine. If the disk fails later, while the
-    records are read, OSError is raised.
+    The records are decisions, labels and events, without decisions that a later one replaces
+    (`Journal.decode_undrained`); the journal's attribute `loss` says which are missing or damaged.
+    Nothing is locked or changed, so an engine may be using the journal. Raise StoreError if the
+    file cannot be opened or is no journal, and for an intact record that cannot be decoded, like
+    that of another release of dengine. If the disk fails later, while the records are read, OSError
+    is raised.
     """
     journal = Journal(path, owning=False)
     try:
@@ -627,12 +634,13 @@ def _pack_fields(fields: Fields) -> bytes:
 
 
 def _unpack_fields(content: bytes) -> Fields:
-    """Return the fields of a header or head, by name; raise one of DAMAGES if it is damaged.
+    """Return the fields of a journal's header or head; raise one of DAMAGES if it is damaged.
 
-    DAMAGES are ValueError, LookupError, TypeError and AttributeError. The field "newest", which
-    names the newest ledger entry, becomes a pair (number, digest) or None; a list in place of the
-    fields is taken for this field alone. The CRC-32 is compared only if there is one: headers of
-    earlier releases have none.
+    The head is a small file beside the journal. The fields are a dict by name. DAMAGES are
+    ValueError, LookupError, TypeError and AttributeError. The field "newest", which names the
+    newest entry of the ledger (the store's hash chain), becomes a pair (number, digest) or None; a
+    list in place of the fields is taken for this field alone. The CRC-32 is compared only if there
+    is one: headers of earlier releases have none.
     """
     fields = json.loads(content.rstrip(b"\0 "))
     if isinstance(fields, list):

@@ -87,12 +87,12 @@ class JournalledStore(Outbox):
     def _compare_with_ledger(self) -> None:
         """Check that the store's ledger has the entries that the journal and its head name.
 
-        The ledger is the store's hash chain, and the head a small file beside the journal. If an
-        entry is missing, the store was cut off or restored from an older copy: an event DATA_LOST
-        (an alarm) is stored, and all records of the journal will be copied to the database again.
-        Otherwise an event that is no alarm is stored if the journal or its head is new or damaged
-        though the store is not new. Either is logged as an error. Raise StoreError only if the
-        database cannot be read or written.
+        The ledger is the store's hash chain, the journal the local file that gets each record
+        first, and the head a small file beside it. If an entry is missing, the store was cut off or
+        restored from an older copy: an event DATA_LOST (an alarm) is stored, and all records of the
+        journal will be copied to the database again. Otherwise an event that is no alarm is stored
+        if the journal or its head is new or damaged though the store is not new. Either is logged
+        as an error. Raise StoreError only if the database cannot be read or written.
         """
         journal = self._journal
         database = self.store.database
@@ -115,12 +115,13 @@ class JournalledStore(Outbox):
     def _drain_leftovers(self) -> None:
         """Copy to the database what an earlier process left in the journal, and clear the journal.
 
-        If records are damaged or missing in the journal, an event DATA_LOST is stored, which is an
-        alarm until a person acknowledges it, and an error is logged. A record that the store
-        refuses becomes an event, "dead letter", and an error is logged, too. Raise StoreError if
-        the database fails, or a record cannot be decoded, for example that of another release, and
-        OSError if the journal cannot be read; the records that were not copied then stay in the
-        journal. Raise StoreError, too, if the journal cannot be cleared.
+        The journal is the local file that gets each record first. If records are damaged or missing
+        in it, an event DATA_LOST is stored, which is an alarm until a person acknowledges it, and
+        an error is logged. In place of a record that the store refuses an event is stored, a "dead
+        letter", and an error is logged, too. Raise StoreError if the database fails, or a record
+        cannot be decoded, for example that of another release, and OSError if the journal cannot be
+        read; the records that were not copied then stay in the journal. Raise StoreError, too, if
+        the journal cannot be cleared.
         """
         since = ""
         for item in self.store.decisions.select(HistoryFilter(), limit=1):
@@ -247,8 +248,8 @@ class JournalledStore(Outbox):
     def request_label_drain(self) -> bool:
         """Return whether the database still lacks a label; if so, have all records copied there.
 
-        Threads write them to the disk and copy them, at once, and are not waited for. If only
-        decisions or events are missing there, this does nothing.
+        Threads do this at once, and are not waited for. If the database lacks only decisions or
+        events, nothing is done, and the result is False.
         """
         with self._changed:
             if self._index.has_undrained_labels:
@@ -270,10 +271,11 @@ class JournalledStore(Outbox):
         """Return a decision with its label from memory or database, or None if unknown.
 
         A label that is not on disk yet is left out, unless `unsynced` is True. A label from memory
-        comes without number and time. Raise StoreError if the database is needed, and there is a
-        `Drainer.fault` (of the journal, too) or no answer within `limit` seconds, or if the stored
-        trace is damaged or cannot be read. Raise it also for an id whose last decision was not
-        recorded, because the id could not be looked up.
+        comes without number and time. Raise StoreError if the database must be asked (the decision
+        is not in memory, and its id may be an old one), and it or the journal (the local file that
+        gets each record first) has a fault, or there is no answer within `limit` seconds. Also if
+        the stored trace is damaged or cannot be read. Raise it also for an id whose last decision
+        was not recorded, because the id could not be looked up.
         """
         with self._changed:
             if decision_id in self._unrecorded:
@@ -309,7 +311,7 @@ class JournalledStore(Outbox):
         """Read the ids of all decisions from the database, and keep their hashes in memory.
 
         By these a new id is recognized without the database. Loading takes about a second for a
-        million ids, without a time limit; other calls to this outbox may go on meanwhile. Once all
+        million ids, without a time limit; other calls to this object may go on meanwhile. Once all
         are loaded, another call does nothing. Raise StoreError if the database cannot be read.
         """
         if self._index.has_all_ids:
@@ -322,8 +324,8 @@ class JournalledStore(Outbox):
     def _load_ids(self) -> None:
         """Load the ids of all decisions (`load_ids`), and try again a second after each failure.
 
-        It ends when that succeeds or the outbox is closed. Until then each id that is not in memory
-        is looked up in the database.
+        It ends when that succeeds or this object is closed. Until then each id that is not in
+        memory is looked up in the database.
         """
         while not self._closed:
             try:
@@ -370,14 +372,15 @@ class JournalledStore(Outbox):
         return self._drainer.wait_for_result(future)
 
     def close(self) -> None:
-        """Copy the records to the database, end the threads, close store and journal.
+        """Copy the recorded decisions, labels and events to the database; close store and journal.
 
-        This ends within seconds; but a `patient` outbox first waits without a time limit for the
-        disk and the database, unless they fail. Records that the database does not take stay in the
-        journal, which is logged, and the next engine copies them. Records that the disk does not
-        take are given up, and an error is logged; no call has said that they are on disk. If the
-        disk hangs, store and journal stay open, and the robot cell is owned until the process ends.
-        A second call does nothing, nor does a call in a forked process.
+        The journal is the local file that gets each record first. The threads are ended, too. This
+        takes seconds at most; but an object made with `patient` first waits without a time limit
+        for the disk and the database, unless they fail. Records that the database does not take
+        stay in the journal, which is logged, and the next engine copies them. Records that the disk
+        does not take are given up, and an error is logged; no call has said that they are on disk.
+        If the disk hangs, store and journal stay open, and no other engine can use the robot cell
+        until the process ends. A second call does nothing, nor does a call in a forked process.
         """
         if not self.is_usable:
             return

@@ -73,29 +73,32 @@ class LabelTable(CellTable):
     ) -> LabelledTraces:
         """Return labelled traces for training, with corrected labels, oldest first.
 
-        Forgotten labels, which a person has taken out of use, are left out, and so are labels of
-        quarantined traces, which are stored but never used in training. A trace that is missing or
-        not as it was stored is left out, too, and an event with the ids of such decisions (of eight
-        at most, and the number of the others) is written to the store, unless it has this event
-        already, or logged if the store cannot be written.
+        The labels are those of this robot cell, or of its product (robot cells that share labels
+        and versions). Forgotten labels, which a person has withdrawn, are left out, and so are
+        labels of quarantined traces, which are stored but never used in training. A label whose
+        trace is missing or not as it was stored is left out, too. An event (a row of the store's
+        log) then has the ids of the decisions concerned, eight at most, and the number of the
+        others. It is not written if the store has the same event already, and it is logged instead
+        if the store cannot be written.
 
         Parameters
         ----------
         limit : int or None
-            Number of newest labels that are read. Labels whose trace is damaged count; forgotten
-            labels and labels of quarantined traces do not. None: all.
+            Number of newest labels, from `first` to `last`, that are read. Labels whose trace is
+            damaged count; forgotten labels and labels of quarantined traces do not. None: all.
         first, last : int, optional
             Numbers of the first and the last label, both included.
         corrected_to : int or None
-            Number of the last correction that is applied, for labels as they stood then; None: all.
+            Only corrections (changes of labels) up to this number are applied, so that labels are
+            as they stood then. None: all.
         cell_only : bool, default False
             Leave out the labels of the product's other robot cells.
 
         Returns
         -------
         LabelledTraces
-            Numbers of the labels, traces, labels (1 or 0) and content hashes, as arrays; empty if
-            there are none.
+            Numbers of the labels, traces, labels (1 or 0) and content hashes (64-bit hashes of the
+            traces or of their parts' numbers), as arrays; empty if there are none.
 
         Raises
         ------
@@ -150,12 +153,13 @@ class LabelTable(CellTable):
     ) -> Iterable[Any]:
         """Run a query for the newest `limit` labels up to number `last`; return rows, newest first.
 
-        `query` must have this limit (None: no limit), order and condition already. In a product a
-        query with a limit is first run on the labels with the 2 * `limit` highest numbers up to
-        `last`, because the database would sort all labels of the product otherwise. If these give
-        fewer than `limit` rows, and in every other case, the query is run on all labels. Its rows
-        are then fetched while the caller goes through them, which the caller must do within the
-        transaction of `connection`.
+        `query` must have this limit (None: no limit), order and condition already. It is run on all
+        labels, and its rows are fetched while the caller goes through them, which the caller must
+        do within the transaction of `connection`. In a product (robot cells that share labels and
+        versions) a query with a limit is first run on the labels with the 2 * `limit` highest
+        numbers up to `last`, because the database would sort all labels of the product otherwise.
+        If these give `limit` rows, or if there are no labels before them, their rows are returned
+        as a list instead.
         """
         if self._scope.product is not None and limit is not None:
             newest = self._scope.newest(connection, LABEL.c.seq)
@@ -169,10 +173,11 @@ class LabelTable(CellTable):
     def past(self, after: int, upto: int | None = None) -> list[PastLabel]:
         """Return this cell's labels as they were recorded, oldest first.
 
-        Labels of quarantined traces, which no version is trained on, are included, and so are
-        forgotten ones. Labels that are not as they were stored are left out. One event with the ids
-        of their decisions, eight at most, is written to the store, unless the robot cell has the
-        same event already; it is logged if the store cannot be written. A label without its
+        Labels of quarantined traces (stored, but never used in training) are included, and so are
+        forgotten ones, which a person has withdrawn. Labels that are not as they were stored are
+        left out. One event (a row of the store's log) with the ids of their decisions, eight at
+        most, and the number of the others is written to the store, unless the robot cell has the
+        same event already; it is logged instead if the store cannot be written. A label without its
         decision is left out, too, without an event. Whether decisions are as they were stored is
         not checked.
 
@@ -186,8 +191,9 @@ class LabelTable(CellTable):
         Returns
         -------
         list of PastLabel
-            Each label with the bounds of its decision and what else a rule is updated with.
-            Corrections are not applied.
+            Each label with the bounds of the success probability that its decision had, and what
+            else a decision rule, which learns from labels, is updated with. Corrections, which
+            change labels later, are not applied.
 
         Raises
         ------
@@ -214,19 +220,21 @@ class LabelTable(CellTable):
     ) -> list[OutcomeRecord]:
         """Return the outcomes that update a decision rule, with corrected labels, oldest first.
 
-        Left out are forgotten labels, labels without their decision, labels of quarantined traces
-        (stored, but never used in training), and labels of rejected parts (`Source.INSPECTION`),
-        because somebody chooses which of these parts come back. Only this cell's labels count:
-        labels of other robot cells are no evidence for this one, and a drift detector that counts
-        them would notice too late that this cell has changed. Whether labels and decisions are as
-        they were stored is not checked here.
+        A decision rule turns the bounds of a part's success probability into an action, and learns
+        from outcomes. Left out are forgotten labels (withdrawn by a person), labels without their
+        decision, labels of quarantined traces (stored, but never used in training), and labels of
+        rejected parts (`Source.INSPECTION`), because somebody chooses which of these parts come
+        back. Only this cell's labels count: labels of other robot cells are no evidence for this
+        one, and a drift detector (a running test for too many wrong decisions) that counts them
+        would notice too late that this cell has changed. Whether labels and decisions are as they
+        were stored is not checked here.
 
         Parameters
         ----------
         seq : int
             Outcomes of labels after this number.
         since_version : int, default 0
-            Only of decisions by this version or a later one.
+            Only of decisions by this version of the model or a later one, overdue checks included.
         overdue_to : int, default 0
             Up to this decision number a check (action VERIFY) without a label is overdue, and its
             decision counts as wrong until its label comes; 0: none is. Overdue checks are included
@@ -240,7 +248,11 @@ class LabelTable(CellTable):
         Returns
         -------
         list of OutcomeRecord
-            Bounds of the decision, label, what the model alone would have done, and so on.
+            For each label its number, the bounds of the decision, the label, whether the trace was
+            novel (unlike all labelled traces), the number of accepted parts without a report since
+            the label before, what the model alone would have done, and the probability with which
+            the part was to be checked (0 if no check was asked for). `overdue_outcomes` says what
+            an overdue check has in their place.
         """
         label = corrected_label()
         # A label that does not know came right after its decision, as most do.
@@ -280,14 +292,15 @@ class LabelTable(CellTable):
     def unreported_total(self, since_version: int = 0) -> int:
         """Return how many accepted parts before the cell's newest label had no report.
 
-        Each label stores, as `silent`, the number of such parts since the label before it. The sum
-        over the cell's labels, forgotten ones included, is returned; labels of quarantined traces
-        (stored, but never used in training) are left out.
+        Each label stores, as `silent`, the number of such parts since the label before it, less 1
+        if its own part was counted before. The sum over the cell's labels is returned, with
+        forgotten ones (withdrawn by a person), and without labels of quarantined traces (stored,
+        but never used in training).
 
         Parameters
         ----------
         since_version : int, default 0
-            Only labels that came while this version or a later one was in force.
+            Only labels that came while this version of the model or a later one was in force.
 
         Returns
         -------
@@ -299,7 +312,7 @@ class LabelTable(CellTable):
         return int(self._read(query)[0][0] or 0)
 
     def _record_left_out(self, damaged: Sequence[str], part: str) -> None:
-        """Write an event to the store that says that some traces or labels were left out.
+        """Write an event (a row of the store's log): some traces or labels were left out.
 
         `damaged` has the ids of their decisions, of which the event names eight and counts the
         others; `part` says what is damaged, "trace" or "label". Nothing is written without ids, or

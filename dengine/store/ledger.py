@@ -63,11 +63,13 @@ NOT_SUMMED = {"sum", "state"}
 
 
 def row_sum(table: str, row: Row) -> bytes:
-    """Return the sum of a row: SHA-256 over the table's name and each value's name, type and bytes.
+    """Return the checksum of a row: SHA-256 over the names of table and columns, and the values.
 
-    It is the same on SQLite and PostgreSQL, as written and as read: true is 1 (SQLite has no
-    booleans), None and NaN are left out and -0.0 is 0.0 (SQLite keeps neither). The order of the
-    columns does not matter, and the columns `sum` and `state` are left out.
+    It is the same on SQLite and PostgreSQL, before a row is written and after it is read: True
+    counts as the integer 1 (SQLite has no booleans), None and NaN are left out and -0.0 counts as
+    0.0 (SQLite keeps neither). Otherwise the type of a value counts, too. The order of the columns
+    does not matter. The columns `sum` (the stored checksum) and `state` (which has a checksum of
+    its own) are left out.
 
     Parameters
     ----------
@@ -82,7 +84,7 @@ def row_sum(table: str, row: Row) -> bytes:
     Raises
     ------
     TypeError
-        For a value of another type, a subclass of these included.
+        For a value of another type, also of a subclass of these.
     """
     pieces = [table.encode(), b"\n"]
     for name, begin in _summed_columns(
@@ -144,9 +146,10 @@ def ledger_key() -> bytes:
 
 
 def check_key(connection: sa.Connection, cell_id: str, key: bytes, begin: bool = False) -> None:
-    """Check that a cell's ledger was begun with this key, or without a key.
+    """Check that a cell's ledger (a hash chain) was begun with this key, or without a key.
 
-    With a key, the digest of each ledger entry is an HMAC that nobody can compute without it.
+    With a key, the digest of each ledger entry (one for each transaction) is an HMAC that nobody
+    can compute without it.
 
     Parameters
     ----------
@@ -156,7 +159,7 @@ def check_key(connection: sa.Connection, cell_id: str, key: bytes, begin: bool =
         b"" for a ledger without a key.
     begin : bool, default False
         If the robot cell has no ledger entry and no key yet, store a setting by which this key is
-        recognized later (a keyed digest, not the key), without a commit; nothing for b"".
+        recognized later (a keyed digest, not the key), without a commit. For b"" nothing is stored.
 
     Raises
     ------
@@ -185,9 +188,10 @@ def check_key(connection: sa.Connection, cell_id: str, key: bytes, begin: bool =
 def newest_entry(connection: sa.Connection, cell_id: str) -> Any:
     """Return a row (number, digest, chains) of a cell's newest ledger entry; None if it has none.
 
-    `digest` is 32 bytes. `chains` is JSON: by the name of each table that an engine reads at its
-    start, the table's chain, a digest over all rows that it has so far (of the settings, over the
-    present ones). A table that never had a row is missing there.
+    The ledger is the cell's hash chain, with an entry for each transaction. `digest` is 32 bytes.
+    `chains` is JSON: by the name of the table (label, correction, model_version or setting) a
+    digest over all rows that it has so far, for settings over the present ones. A table that never
+    had a row is missing there.
     """
     return connection.execute(
         sa.select(*LEDGER.c["number", "digest", "chains"])
@@ -200,8 +204,8 @@ def newest_entry(connection: sa.Connection, cell_id: str) -> Any:
 def rows_digest(sums: Mapping[str, Iterable[bytes]]) -> bytes:
     """Return the SHA-256 (32 bytes) over the checksums of rows (`row_sum`), given by table.
 
-    Neither the order of the tables nor that of the rows matters. A table without rows is part of
-    the digest, too: without it the digest is another one.
+    Neither the order of the tables nor that of the rows matters. A table that is given without rows
+    counts, too: if it is left out, the digest is another one.
     """
     digest = hashlib.sha256()
     for table in sorted(sums):
@@ -251,9 +255,10 @@ def _settings_text(connection: sa.Connection, cell_id: str) -> str:
 
 
 def parse_object(text: Any) -> dict[str, Any]:
-    """Return the fields of a JSON object that a ledger entry holds; {} if it is damaged or None.
+    """Return the fields of a JSON object from a ledger (a hash chain); {} if it is damaged.
 
-    `text` is as the driver returned it, so it may be anything. Nothing is raised.
+    `text` is as the database driver returned it, so it may be anything: {} also for None, and for
+    JSON that is no object. Nothing is raised.
     """
     with suppress(ValueError, TypeError, RecursionError):
         fields = json.loads(text)
@@ -297,8 +302,10 @@ class LedgerEntry:
     def add_rows(self, table: str, rows: Sequence[Row]) -> list[Row]:
         """Add the checksums of rows, which are about to be inserted into a table, to this entry.
 
-        Return copies of the rows with two more columns: `entry`, the number of this entry, and
-        `sum`, the checksum (`row_sum`). Raise TypeError for a value that `row_sum` refuses.
+        The entry will stand for this transaction in the ledger, the store's hash chain. Return
+        copies of the rows with two more columns: `entry`, the number of this entry, and `sum`, the
+        checksum (`row_sum`). Nothing is inserted here. Raise TypeError for a value that `row_sum`
+        refuses.
         """
         chained = [{**row, "entry": self._number} for row in rows]
         for row in chained:
@@ -309,10 +316,11 @@ class LedgerEntry:
     def append(self, clock: Clock) -> EntryName | None:
         """Insert the entry into the ledger, as the transaction's last step; this does not commit.
 
-        The entry says how many rows were added to each table. It has a digest over their checksums,
-        the chains, extended by them, of the tables that an engine reads at its start (`IN_FORCE`),
-        and a digest over all this and the entry before. If settings were written, it also has a
-        copy of all settings of the engine.
+        The ledger is the store's hash chain. The entry says how many rows the transaction added to
+        each table. It has a digest over the checksums of these rows, and for each table that an
+        engine reads at its start (`IN_FORCE`) a digest over all its rows so far. If settings were
+        written, it also has a copy of all settings of the engine. Its own digest is over all this
+        and the digest of the entry before.
 
         Parameters
         ----------
@@ -352,10 +360,11 @@ class LedgerEntry:
 def find_integrity_error(connection: sa.Connection, cell_id: str, key: bytes, first: int) -> str:
     """Compare the rows of a robot cell that an engine reads with the cell's ledger.
 
-    These are the settings, corrections, versions and newest labels. Of the ledger itself only the
-    newest entry is checked. Rows that name a later entry are not read, because another connection
-    may write meanwhile. A cell without any entry must have no settings (but those that the store
-    itself keeps), and no row that names no entry.
+    The ledger is a hash chain with an entry for each transaction. The rows are the settings,
+    corrections of labels, model versions and newest labels. Of the ledger itself only the newest
+    entry is checked. Rows that name a later entry are not read, because another connection may
+    write meanwhile. A cell without any entry must have no settings (except those that the store
+    itself keeps) and none of the other rows.
 
     Parameters
     ----------
@@ -366,7 +375,7 @@ def find_integrity_error(connection: sa.Connection, cell_id: str, key: bytes, fi
     first : int
         Number of the first label that is checked; earlier labels that belong to the same ledger
         entry are checked, too. Settings, corrections and versions are checked in full, but for the
-        versions' stored states.
+        versions' stored states (their arrays).
 
     Returns
     -------
@@ -407,12 +416,13 @@ def _find_table_error(
 ) -> str:
     """Compare a cell's rows of the table `name` with the ledger.
 
-    Return the first difference in words, or "". A difference is a row whose values do not fit its
-    stored sum, or rows that were removed, added or replaced. The stored states of versions are not
-    read. `name` is that of a table in IN_FORCE. `chained` is the chain of the table, the digest
-    over all its rows so far, that ledger entry `last_entry` has. Rows of later entries are not
-    read, since another connection may write meanwhile. Reading begins at number `first`, or at an
-    earlier row that belongs to the same ledger entry.
+    The ledger is a hash chain with an entry for each transaction. Return the first difference in
+    words, or "". A difference is a row whose values do not fit its stored checksum, or rows that
+    were removed, added or replaced. `name` is that of a table in IN_FORCE: labels, corrections or
+    versions; the stored states of versions (their arrays) are not read. `chained` is the digest
+    over all rows of the table so far that ledger entry `last_entry` has. Rows of later entries are
+    not read, since another connection may write meanwhile. Reading begins at number `first`, or at
+    an earlier row that belongs to the same ledger entry; rows before it are not checked.
     """
     number = IN_FORCE[name]
     table = number.table
@@ -464,15 +474,16 @@ def chain_writes(engine: sa.Engine) -> None:
 def _chain_statement(
     connection: sa.Connection, statement: Any, many: Any, single: Any, options: Any
 ) -> tuple[Any, Any, Any]:
-    """Add rows that are about to be inserted to the transaction's ledger entry.
+    """Add the checksums of rows that are about to be inserted to the transaction's ledger entry.
 
-    SQLAlchemy calls this before it executes a statement. The parameters are in `many`, a list of
-    rows, or in `single`, one row; `options` are not used. Return the statement with its parameters.
-    Copies of rows for a table of CHAINED, whose rows the ledger covers, get the number of the entry
-    and their sum. All other statements, and all those outside a write transaction of `Database`,
-    are returned unchanged; if settings are written, the entry will have a copy of them all. Raise
-    StoreError for an insert into a table of CHAINED whose rows are inside the statement instead of
-    its parameters, and TypeError for a value of such a row that `row_sum` refuses.
+    The ledger is the store's hash chain. SQLAlchemy calls this before it executes a statement. The
+    parameters are in `many`, a list of rows, or in `single`, one row; `options` are not used.
+    Return the statement with its parameters. For an insert into a table of CHAINED, whose rows the
+    ledger covers, these are copies of the rows, with the number of the entry and their checksum.
+    All other statements, and all those outside a write transaction of `Database`, are returned
+    unchanged; if settings are written, the entry will have a copy of them all. Raise StoreError for
+    an insert into a table of CHAINED whose rows are inside the statement instead of its parameters,
+    and TypeError for a value of such a row that `row_sum` refuses.
     """
     entry: LedgerEntry | None = connection.get_execution_options().get("dengine_entry")
     if entry is None or not isinstance(statement, sa.Insert | sa.Update | sa.Delete):

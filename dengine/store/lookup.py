@@ -41,13 +41,13 @@ class DecisionIndex:
         self.has_all_ids = False
 
     def add(self, entry: Entry) -> None:
-        """Add a record that was just recorded; an event, which has no id, changes nothing.
+        """Add a decision or label that was just recorded; an event, without an id, changes nothing.
 
-        `entry` holds the record. It replaces an earlier decision of that id, or an earlier label of
-        that decision. A decision enters `recent`, and the oldest leaves it if there are then more
-        than N_RECENT (1,000). A decision that replaces one in `recent` keeps its place in the
-        order, and any other is the newest. `find` finds a decision that left `recent` until the
-        database has it.
+        `entry` holds this record. It replaces an earlier decision with the same id, or an earlier
+        label of the same decision. A decision enters `recent`, the newest decisions by id, and the
+        oldest leaves it if there are then more than N_RECENT (1,000). A decision that replaces one
+        in `recent` keeps its place in the order, and any other is the newest. `find` finds a
+        decision that left `recent` until the database has it.
         """
         record = entry.record
         if isinstance(record, StoredDecision):
@@ -61,9 +61,10 @@ class DecisionIndex:
             self._labels[record.decision_id] = entry
 
     def is_replaced(self, entry: Entry) -> bool:
-        """Return whether a later record of the same decision replaces this undrained one.
+        """Return whether a later record of the same decision replaces this one.
 
-        False for a label or an event.
+        `entry` holds a record that was not copied to the database yet. False for a label or an
+        event.
         """
         record = entry.record
         return (
@@ -72,13 +73,13 @@ class DecisionIndex:
         )
 
     def remove_drained(self, entry: Entry) -> None:
-        """Remove a record that the database has now.
+        """Remove a record from those that wait for the database, which has it now.
 
-        `entry` holds the record. The newest N_RECENT decisions (1,000) stay in `recent`. If the
-        record is a label, its decision there is replaced by a copy with the label, without the
-        label's number and time; a later label of the decision is not removed. An event changes
-        nothing, nor does a decision if another with the same id was added after it. Raise KeyError
-        for a label if no label of its decision waits for the database.
+        `entry` holds the record. The newest N_RECENT decisions (1,000) stay in memory, in `recent`.
+        If the record is a label, and its decision is there, that is replaced by a copy with the
+        label, without the label's number and time; a later label of the decision is not removed. An
+        event changes nothing, nor does a decision if another with the same id was added after it.
+        Raise KeyError for a label if no label of its decision waits for the database.
         """
         record = entry.record
         if isinstance(record, StoredDecision) and not self.is_replaced(entry):
@@ -100,8 +101,8 @@ class DecisionIndex:
         -------
         decision : StoredDecision or None
             One of the newest N_RECENT decisions (1,000), or of those that the database lacks;
-            otherwise None. Among the newest it has its label, if the database got the label while
-            it was there.
+            otherwise None. One of the newest has its label, if the database got the label while the
+            decision was among the newest.
         label : NewLabel or None
             The label of the decision, if the database lacks it. None if there is none, or if it is
             not on disk yet and `unsynced` is False.

@@ -53,8 +53,9 @@ class MemoryStore(Outbox):
         """Write the model versions and the records that wait in memory to the database.
 
         It is called before each use of the store, when 40 versions wait, and after each event of an
-        engine that only reads. The versions are written first. Raise StoreError if the database
-        cannot be written; what was not written by then is lost.
+        engine that only reads. The versions are written first, then the records (decisions, labels
+        and events). Raise StoreError if the database cannot be written; what was not written by
+        then is lost.
         """
         versions = self._versions
         records = self._unwritten
@@ -69,7 +70,8 @@ class MemoryStore(Outbox):
     def record_decision(self, item: StoredDecision) -> StoredDecision:
         """Keep a copy of a decision with the cell's next number in memory, and return it.
 
-        That its id is new is not checked.
+        It is written to the database when somebody uses the store. That its id is new is not
+        checked.
         """
         self.n_decisions += 1
         item = replace(item, number=self.n_decisions)
@@ -80,8 +82,10 @@ class MemoryStore(Outbox):
     def record_labels(self, labels: Iterable[tuple[StoredDecision, NewLabel]]) -> None:
         """Keep copies of labels in memory; `labels` holds pairs of a decision and its label.
 
-        Each copy gets the present time, and the content hash and time of its decision. If the
-        decision is still in memory, a copy of the passed one with the label takes its place.
+        Each copy gets the present time, and of its decision the content hash (a hash of the trace
+        or of the part's number) and the time. The labels are written to the database when somebody
+        uses the store. If the decision is still in memory, a copy of the passed one with the label
+        takes its place.
         """
         for item, label in labels:
             label = self._completed(item, label)
@@ -115,10 +119,11 @@ class MemoryStore(Outbox):
         `last_seq` is the number of the newest label that the retrain knew of, and `state` holds the
         arrays by name. The result of the future is the report's version number. The retrain is
         written to the database together with the other records, when somebody uses the store, or
-        when 40 retrains wait: packing a retrain takes as long as many decisions. Raise StoreError
-        if `report.accepted` is True and there are no arrays, for an array of Python objects, and if
-        40 retrains wait and the database cannot be written. In this last case all that waited and
-        was not written by then is lost, records included.
+        when 40 retrains wait, because packing its arrays takes as long as many decisions. Raise
+        StoreError if `report.accepted` is True (the version is to be put in force) and there are no
+        arrays, for an array of Python objects, and if 40 retrains wait and the database cannot be
+        written. In this last case all that waited and was not written by then is lost, records
+        included.
         """
         self._versions.append((report, last_seq, check_state(report, state), self.store.clock()))
         if len(self._versions) == MAX_UNWRITTEN_VERSIONS:

@@ -40,9 +40,9 @@ def open_store(
     ----------
     store : None, str, path or SqlStore
         None: a store in memory. A file or URL: a database; a `CellAddress`, a text that `address`
-        returns, also names the robot cell and its product (what the cell makes), otherwise the cell
-        is "cell". A file is created if need be, but not its folder. An open store is returned
-        unchanged.
+        returns, also names the robot cell and its product (what the cell makes; cells of one
+        product share labels and versions), otherwise the cell is "cell". A file is created if need
+        be, but not its folder. An open store is returned unchanged.
     must_exist : bool, default False
         Raise a StoreError for a file or cell that does not exist, instead of creating it. Without
         effect on None and on an open store.

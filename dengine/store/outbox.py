@@ -78,7 +78,7 @@ class Outbox(ABC):
         """Raise a StoreError if the engine is closed, only reads, or was opened before a fork.
 
         To use what was opened before a fork is an error only in the child process. Faults of the
-        store and integrity errors are not raised.
+        store, and rows that are not as they were written (`integrity_error`), are not raised.
         """
         if os.getpid() != self._pid:
             raise forked_error(self._pid, "the engine")
@@ -109,8 +109,8 @@ class Outbox(ABC):
         If it is set already, or `error` is "", nothing changes, and nothing is logged. Advice for
         the user is added to the text.
 
-        From then on the engine decides VERIFY on every workpiece, without asking the model, until
-        the store is opened again.
+        From then on the engine decides VERIFY (the slow check must measure the part) on every part,
+        without asking the model, until the store is opened again.
         """
         if error and not self.integrity_error:
             self.integrity_error = (

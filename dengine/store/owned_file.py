@@ -22,9 +22,10 @@ def _lock_of_system() -> Callable[[int], object]:
     """Return a function that locks an open file, given by its descriptor, for this process.
 
     The function does not wait: it raises BlockingIOError if another descriptor has the lock, and
-    otherwise the OSError of the system, for example if the file system has no locks. The lock ends
-    when the file is closed or the process ends. It is an exclusive lock by `flock`. On Windows one
-    byte far behind the content is locked, and the function moves the offset of the file there.
+    the OSError of the system if it fails for another reason, for example because the file system
+    has no locks. The lock ends when the file is closed or the process ends. It is an exclusive lock
+    by `flock`. On Windows one byte far behind the content is locked, and the function moves the
+    offset of the file there.
     """
     try:
         import fcntl

@@ -51,11 +51,13 @@ def check_peer_settings(
 ) -> None:
     """Check that two robot cells of a product would embed a trace in the same way.
 
-    The settings on which the arrays of a version depend must be equal: `reducer`, `params`,
-    `folds`, `window` and `novelty` of the `Recipe`, the seed, the `TraceSpec`, and the name and
-    description of an object that a user passed as reducer or model. The policy and the rest of the
-    `Recipe`, like the radius and the time budget of a retrain, may differ. Nothing is compared if
-    one of the cells has no recipe yet. The `TraceSpec` is compared only if both cells have one.
+    A product is robot cells that share labels and versions (trained models). The settings on which
+    the arrays of a version depend must be equal: `reducer`, `params`, `folds`, `window` and
+    `novelty` of the `Recipe` (all settings of an engine), the seed, the `TraceSpec` (what traces
+    look like), and the name and description of an object that a user passed as reducer or model.
+    The policy and the rest of the `Recipe`, like the radius and the time limit of a retrain, may
+    differ. Nothing is compared if one of the cells has no recipe yet. The `TraceSpec` is compared
+    only if both cells have one.
 
     Parameters
     ----------
@@ -117,11 +119,13 @@ def check_cell_exists(url: str, cell_id: str) -> None:
 def list_cells(url: str) -> list[CellSummary]:
     """Return a summary of every robot cell of a database, sorted by cell_id.
 
-    It has the cell's product, its numbers of decisions and labels, the newest version that was put
-    in force in the cell or its product, and the time of the newest decision or label. Forgotten
-    labels count, and so do labels of quarantined traces, which are never trained on. Records that a
-    journal holds and the database does not hold yet do not count. Raise StoreError if the database
-    is not there, is no store or cannot be read. No row is written (see `reading`).
+    It has the cell's product (robot cells of one product share labels and versions), its numbers of
+    decisions and labels, the newest version of the model that was put in force in the cell or its
+    product, and the time of the newest decision or label. Forgotten labels (withdrawn by a person)
+    count, and so do labels of quarantined traces, which are never trained on. Records that a
+    journal, a cell's log on disk, holds and the database does not hold yet do not count. Raise
+    StoreError if the database is not there, is no store or cannot be read. No row is written (see
+    `reading`).
     """
     with reading(url) as connection:
         settings = connection.execute(sa.select(SETTING)).all()
@@ -131,10 +135,12 @@ def list_cells(url: str) -> list[CellSummary]:
 
 
 def _summarize(connection: sa.Connection, cell: Scope) -> CellSummary:
-    """Return the summary of a robot cell, as `list_cells` describes it.
+    """Return the summary of a robot cell: counts, newest model version, time of the last record.
 
-    `cell` has the cell's id and its product. With a product, `version` is the newest version of all
-    its cells.
+    `cell` has the cell's id and its product (robot cells that share labels and versions). The
+    numbers of decisions and labels are the cell's own. `version` is the newest version that was put
+    in force in the cell or its product, None before the first; `last_seen` the time of the newest
+    decision or label, None before the first decision.
     """
     (n_decisions, last_decision), (n_labels, last_label) = (
         connection.execute(

@@ -52,7 +52,7 @@ class Scope:
     def cells(self, connection: sa.Connection) -> list[str]:
         """Return the id of this robot cell first, then those of its product's other cells, sorted.
 
-        Without a product: this cell alone.
+        A product is robot cells that share labels and versions. Without a product: this cell alone.
         """
         peers = connection.execute(
             cells_of(self.product or "").order_by(SETTING.c.cell_id)
@@ -63,9 +63,10 @@ class Scope:
         """Return a label number such that the newest `window` training labels are at or after it.
 
         Labels are numbered in the order in which they came; training labels are those of traces
-        that are not quarantined. 1 if there are fewer than `window`. For a product the labels are
-        not read, and the number is an estimate, the newest number + 1 - 2 * `window`: it may be
-        below 1, and is too high if more than half of the newest labels are no training labels.
+        that are not quarantined (kept out of training). 1 if there are fewer than `window`. For a
+        product (robot cells that share labels and versions) the labels are not read, and the number
+        is an estimate, the newest number + 1 - 2 * `window`: it may be below 1, and is too high if
+        more than half of the newest labels are no training labels.
         """
         if self.product is not None:  # by their numbers, or all would be read to be sorted
             return self.newest(connection, LABEL.c.seq) + 1 - 2 * window
@@ -83,8 +84,9 @@ class Scope:
 
         `column` is the table's column of numbers, and `connection` is in a write transaction that
         has locked the robot cell. The number is one more than the largest so far. If the cell has a
-        product, decisions and events are numbered by cell, all other rows by product, and for these
-        this call locks the product. Without a product all rows are numbered by cell.
+        product (robot cells that share labels and versions), decisions and events are numbered by
+        cell, all other rows by product, and for these this call locks the product until the
+        transaction ends. Without a product all rows are numbered by cell.
         """
         if self.product is None or column.table in (DECISION, EVENT):
             return Scope(self.cell_id).newest(connection, column) + 1
@@ -96,8 +98,9 @@ class Scope:
     ) -> int:
         """Return the largest number in a column over the cell's rows.
 
-        If the robot cell has a product, the rows of all cells of the product count. With
-        `conditions`, only over the rows that fulfil them all. 0 if there is none.
+        If the robot cell has a product (robot cells that share labels and versions), the rows of
+        all its cells count. With `conditions`, only over the rows that fulfil them all. 0 if there
+        is none.
         """
         query = sa.select(sa.func.max(column)).where(
             column.table.c.cell_id == self.cell_id, *conditions
@@ -124,14 +127,13 @@ def cells_of(product: str) -> sa.Select[Any]:
 def newest_of(
     product: str, column: sa.Column[Any], *conditions: sa.ColumnElement[bool]
 ) -> sa.Select[Any]:
-    """Return the query for the largest number in a column over a product's robot cells; it is not
-    run.
+    """Return the query for the largest number in a column over a product's robot cells.
 
-    With `conditions`, only over the rows that fulfil them all. The result is NULL if there is none.
-    `column` has a table's row numbers. In the table of versions each cell's newest retrain that
-    fulfils the conditions counts, so `column` must increase with the table's column `retrain`. The
-    query is fast: for each cell the database reads the index from its end, one row if the
-    conditions hold there.
+    It is not run. A product is robot cells that share labels and versions. With `conditions`, only
+    over the rows that fulfil them all. The result is NULL if there is none. `column` has a table's
+    row numbers. In the table of versions each cell's newest retrain that fulfils the conditions
+    counts, so `column` must increase with the table's column `retrain`. The query is fast: for each
+    cell the database reads the index from its end, one row if the conditions hold there.
     """
     table = column.table
     peer = cells_of(product).subquery()
@@ -145,9 +147,9 @@ def newest_of(
 def join_product(connection: sa.Connection, cell_id: str, product: str | None) -> str | None:
     """Return a cell's product, or None; make a new robot cell a cell of `product`.
 
-    Such a cell gets a new row in the table `setting`, and the product is locked until the
-    transaction ends; nothing is committed. Of a cell that has its product already nothing is
-    changed.
+    Cells of one product share labels and versions. A new cell gets a row in the table `setting`,
+    and the product is locked until the transaction ends; nothing is committed. If the cell has this
+    product already, nothing is changed.
 
     Parameters
     ----------
@@ -160,9 +162,10 @@ def join_product(connection: sa.Connection, cell_id: str, product: str | None) -
     Raises
     ------
     StoreError
-        If the cell has another product. Of a cell without a product, if the name is blank or not
+        If the cell has another product. For a cell without a product, if the name is blank or not
         printable, and if the cell has labels already, or settings other than those that the store
-        itself keeps (`RESERVED`): its labels were numbered without those of the other cells.
+        itself keeps (`RESERVED`), because its labels were numbered without those of the other
+        cells.
     """
     stored = read_setting(connection, cell_id, PRODUCT_KEY)
     if product is None or stored == product:
@@ -203,12 +206,13 @@ WITH_TRACES = DECISION.outerjoin(TRACE, TRACE_OF_DECISION)
 def corrected_label(corrected_to: int | None = None) -> sa.ColumnElement[int | None]:
     """Return the SQL column of a label after corrections: 0, 1 or FORGOTTEN (2).
 
-    It is NULL without a label. The query that uses it must have the table `label`.
+    FORGOTTEN is a label that a person has withdrawn; without a label the column is NULL. The newest
+    correction of a label counts. The query that uses the column must have the table `label`.
 
     Parameters
     ----------
     corrected_to : int or None
-        Number of the last correction that is applied; None: all are.
+        Only corrections up to this number are applied; None: all are.
     """
     value = sa.func.coalesce(
         sa.cast(CORRECTION.c.success, sa.Integer), sa.literal_column(str(FORGOTTEN))
@@ -222,9 +226,11 @@ def corrected_label(corrected_to: int | None = None) -> sa.ColumnElement[int | N
 def audit_columns() -> tuple[sa.ColumnElement[int], sa.ColumnElement[float]]:
     """Return two SQL columns of a decision: `predicted` and `inclusion_probability`.
 
-    `predicted` is what the model alone would have done, as an `ActionCode` (an integer): the
-    position of the action in ACTIONS. `inclusion_probability` is `Decision.propensity`, the
-    probability with which the part was to be verified, if the action is VERIFY, else 0.
+    By these a decision rule tells audits (checks of parts that the model would have decided without
+    a check) from other checks. `predicted` is what the model alone would have done, as an
+    `ActionCode`: 0 verify, 1 accept, 2 reject. `inclusion_probability` is `Decision.propensity`,
+    the probability with which the part was to be verified (checked), if the action is VERIFY, else
+    0.
     """
     positions = {action.value: position for position, action in enumerate(ACTIONS)}
     probability = sa.case(
@@ -252,9 +258,11 @@ SOURCE: sa.ColumnElement[str | None] = sa.case(
 def past_query(cell_id: str) -> sa.Select[Any]:
     """Return the query for a cell's decisions with their corrected labels; it is not run.
 
-    `read_decision` reads its rows: all columns of a decision, and of its label success (None if it
-    was forgotten), source ("stop" if it was "confirmed" and was corrected to bad), number and time.
-    Decisions without a label are included; traces are not. The rows are in no order.
+    `read_decision` reads its rows: all columns of a decision, and of its label success (None if a
+    person has withdrawn it), source (where it came from), number and time. The source is "stop"
+    (the accepted part was bad and stopped the line) if it was "confirmed" (the part counted as
+    good) and the label was corrected to bad. Decisions without a label are included; traces are
+    not. The rows are in no order.
     """
     return (
         sa.select(
@@ -270,7 +278,11 @@ def past_query(cell_id: str) -> sa.Select[Any]:
 
 
 def n_decisions(cell_id: str) -> sa.ScalarSelect[int]:
-    """Return the scalar subquery for the number of a cell's newest decision, NULL if none."""
+    """Return the scalar subquery for the number of a cell's newest decision, NULL if none.
+
+    Decisions are numbered 1, 2, ... in each robot cell, so this is also how many there are. The
+    query is not run.
+    """
     return (
         sa.select(sa.func.max(DECISION.c.number))
         .where(DECISION.c.cell_id == cell_id)

@@ -95,8 +95,9 @@ class Recorder:
     def fault(self) -> str:
         """Why the journal cannot be written: the last error, or that a sync takes too long.
 
-        A sync takes too long if it lasts longer than `limit` seconds, an argument of `Recorder`. ""
-        if the journal can be written.
+        The journal is the log on the local disk that gets each record first. A sync takes too long
+        if it lasts longer than `limit` seconds, an argument of `Recorder`. "" if the journal can be
+        written.
         """
         seconds = time.monotonic() - self._began
         if self._error or seconds <= self._limit:
@@ -120,11 +121,11 @@ class Recorder:
     def record(self, record: Record) -> Entry:
         """Add a record in memory, and wake the thread that writes it to the journal.
 
-        Return at once the record's `Entry`, which will say where it stands in the journal. If the
-        disk answers, the thread writes it within about BATCH_SECONDS (0.05 s), together with
-        others; after a failed write it tries again up to RETRY_SECONDS (1 s) later. Before `start`
-        and after `stop` the record only stays in memory, without an error. There is no limit to the
-        number of records that wait.
+        A record is a decision, a label or an event. Return at once its `Entry`, which will say
+        where it stands in the journal, a log on the local disk. If the disk answers, the thread
+        writes it within about BATCH_SECONDS (0.05 s), together with others; after a failed write it
+        tries again up to RETRY_SECONDS (1 s) later. Before `start` and after `stop` the record only
+        stays in memory, without an error. There is no limit to the number of records that wait.
         """
         entry = Entry(record)
         with self.changed:
@@ -171,8 +172,9 @@ class Recorder:
     def start(self, kept: object = None) -> None:
         """Start the thread that writes, and keep an object alive as long as it runs.
 
-        Keep the object that owns the SQLite connection: SQLite syncs when it frees a connection,
-        and if the disk hangs when the process ends, the process would never end.
+        Pass as `kept` the object that owns the SQLite connection. SQLite syncs when it frees a
+        connection; if that happened at the end of the process, while the disk hangs, the process
+        would never end.
         """
         self._thread = threading.Thread(
             target=self._run, args=(kept,), name="dengine-journal", daemon=True
@@ -182,8 +184,9 @@ class Recorder:
     def stop(self, seconds: float) -> bool:
         """End the thread, wait for it, and return whether it ended within these seconds.
 
-        Before it ends, the thread writes the records that wait. At the first error it ends at once:
-        those that are left stay unwritten, and nothing is raised. The thread must have been
+        Before it ends, the thread writes the records that wait to the journal, a log on the local
+        disk. At the first error it ends at once: the records that are left stay unwritten, and
+        nothing is raised. If it does not end in time, it goes on. The thread must have been
         started.
         """
         with self.changed:
@@ -193,7 +196,7 @@ class Recorder:
         return not self._thread.is_alive()
 
     def _run(self, kept: object) -> None:
-        """Write and sync new records in batches until stopped.
+        """Write new records to the journal, a log on disk, and sync it, in batches until stopped.
 
         The thread runs this; `kept` is only kept alive by it. A batch has the oldest records, at
         most CHUNK (500). It begins BATCH_SECONDS (0.05 s) after there is a record, or at once if
@@ -225,14 +228,15 @@ class Recorder:
                     self.changed.wait(RETRY_SECONDS)
 
     def _write(self, batch: Sequence[Entry]) -> None:
-        """Append a batch of records to the journal, sync it, move them to the queue `synced`.
+        """Append a batch of records to the journal, sync it, and move them to the queue `synced`.
 
-        They are the oldest of the queue `unwritten`, and leave it. Each gets its `offset` and
-        `end`, the last error is cleared, and threads that wait for `changed` are woken. A journal
-        of more than 8 MiB is cleared first, if the `Drainer` copies its last records to the
-        database within BATCH_SECONDS (0.05 s). If the journal's file was deleted, moved or
-        replaced, it is created again, which is logged, and an event says so. Raise StoreError if
-        the disk fails, or that file cannot be created; the entries then stay in `unwritten`.
+        The journal is the log on the local disk. The records are the oldest of the queue
+        `unwritten`, and leave it. Each gets its `offset` and `end`, the last error is cleared, and
+        threads that wait for `changed` are woken. A journal of more than 8 MiB is cleared first, if
+        the `Drainer` copies its last records to the database within BATCH_SECONDS (0.05 s). If the
+        journal's file was deleted, moved or replaced, it is created again, which is logged and
+        recorded as an event. Raise StoreError if the disk fails, or that file cannot be created;
+        the entries then stay in `unwritten`.
         """
         if self._journal.end > LONG:  # a cell that never pauses would fill the disk
             with self.changed:

@@ -84,14 +84,16 @@ def already_reported(
 ) -> ReportConflictError:
     """Return the error for a second label of a decision; it names both labels.
 
-    If both have the same success, its advice is that nothing more needs reporting.
+    If both have the same success, its advice is that nothing more needs reporting. Otherwise it is
+    to correct the first label if that was wrong, or if it was forgotten and is to count again.
 
     Parameters
     ----------
     decision_id : str
     first, second : (bool, Source)
         Success and source of the label that stands, and of the one that came now. None in the place
-        of the first success is a forgotten label, which only a correction brings back.
+        of the first success is a forgotten label (withdrawn by a person), which only a correction
+        brings back.
 
     Returns
     -------
@@ -112,7 +114,7 @@ def already_reported(
 
 
 def nothing_to_correct(decision_id: str) -> ReportError:
-    """Return the error for a correction of a decision that has no label."""
+    """Return the error for a correction (a change of a label) of a decision that has no label."""
     return ReportError(
         f"Expected a decision with a label, got {decision_id!r}, of which nothing was reported "
         "yet; there is nothing to correct: report its label."
@@ -122,8 +124,8 @@ def nothing_to_correct(decision_id: str) -> ReportError:
 def as_data(data: Mapping[str, Any] | None) -> dict[str, Any] | None:
     """Return an event's data in a new dict, as if it was written to JSON and read; None for None.
 
-    A tuple becomes a list, and a key that is a number, a bool or None a text. Raise StoreError for
-    values that JSON does not have, NaN and infinity included.
+    A tuple becomes a list, and a key that is a number, a bool or None becomes a text. Raise
+    StoreError for values that JSON does not have, NaN and infinity included.
     """
     with instead(
         StoreError,
@@ -143,8 +145,9 @@ def as_text(text: str) -> str:
 def check_state(report: RetrainReport, state: Arrays | None) -> State | None:
     """Check a version's arrays and return copies of them, by name; None if `state` is None.
 
-    Raise StoreError if `report.accepted` is True (the version is to be put in force) and `state` is
-    None, and for an array of Python objects, which would need a pickle.
+    A version is a trained model. Raise StoreError if `report.accepted` is True (the version is to
+    be put in force) and `state` is None, and for an array of Python objects, which would need a
+    pickle.
     """
     if state is None:
         if report.accepted:
@@ -319,16 +322,18 @@ class OutcomeRecord(NamedTuple):
 
 
 def overdue_outcomes(decision: Decision) -> list[OutcomeRecord]:
-    """Return the outcomes that a rule counts for a check that is overdue.
+    """Return the outcomes with which a decision rule is updated for an overdue check.
 
-    A check is overdue if no report has come within `Policy.label_within` decisions. Until it comes
-    the rule counts what is worst. If the part had evidence for success (lower > 0), there is an
-    outcome "failure", with the decision's lower bound, and 1 as the upper one; its `predicted` is
-    ACCEPT if the model alone would have accepted the part. If the part had evidence for failure
-    (upper < 1), there is then an outcome "success", with 0 as the lower bound, and the decision's
-    upper one; its `predicted` is REJECT if the model alone would have rejected the part. Otherwise
-    `predicted` is VERIFY. So there are none, one or two, all with `seq` 0, not novel, with `silent`
-    0 and the inclusion probability of the decision.
+    A check is overdue if no report has come within `Policy.label_within` later decisions. Until it
+    comes the rule counts the worst. If the decision had evidence for success (`lower`, the lower
+    bound of the success probability, is above 0), there is an outcome "failure", with this lower
+    bound, and 1 as the upper one; its `predicted` is ACCEPT if the model alone would have accepted
+    the part. If it had evidence for failure (`upper` < 1), there is then an outcome "success", with
+    0 as the lower bound, and the decision's upper one; its `predicted` is REJECT if the model alone
+    would have rejected the part. Otherwise `predicted` is VERIFY. It is given as an `ActionCode`: 0
+    VERIFY, 1 ACCEPT, 2 REJECT. So there are none, one or two outcomes. All have label number 0
+    (`seq`), are not novel, count no unreported accepted parts (`silent` 0), and have the inclusion
+    probability of the decision, with which a check was asked for.
     """
     probability = decision.inclusion_probability
     outcomes = []
@@ -512,10 +517,11 @@ class CellAddress(str):
 def address(store: FilePath, cell_id: str | None = None, product: str | None = None) -> str:
     """Return a store's file or URL as text; a `CellAddress` if a robot cell or product is given.
 
-    A `CellAddress` is a text with the attributes `cell_id` and `product`. If only a product is
-    given, or `cell_id` is "", the cell is named "cell". If neither is given, a `store` that is a
-    `CellAddress` already is returned unchanged; otherwise its own cell and product are both
-    dropped, even if only one is given.
+    A `CellAddress` is a text with the attributes `cell_id` and `product` (what the cell makes;
+    cells of one product share labels and versions). If only a product is given, or `cell_id` is "",
+    the cell is named "cell". If neither is given, a `store` that is a `CellAddress` already is
+    returned unchanged; otherwise its own cell and product are both dropped, even if only one is
+    given.
     """
     url = os.fspath(store)
     return (
@@ -599,10 +605,10 @@ def from_row(record_type: Callable[..., T], row: Mapping[str, Any], **given: Any
 def _to_column(value: Any, type_: type) -> Any:
     """Return the value of a field for its column: a text, number, JSON text or packed float32.
 
-    None stays None. `type_` is the type of the field. For a tuple or dict any value that JSON can
-    hold is written, whatever its type; for an array AttributeError is raised if the value is none.
-    For any other type the value is converted to it. ValueError, TypeError or OverflowError is
-    raised if a value cannot be converted or written.
+    None stays None. `type_` is the type of the field. An enumeration becomes its text. For a tuple
+    or dict any value that JSON can hold is written, whatever its type; for an array AttributeError
+    is raised if the value is no array. For any other type the value is converted to it. ValueError,
+    TypeError or OverflowError is raised if a value cannot be converted or written.
     """
     if value is None:
         return None
@@ -698,8 +704,9 @@ def to_npz(state: Arrays) -> bytes:
 def from_npz(blob: bytes, name: str) -> State:
     """Return the arrays that `to_npz` wrote, by name.
 
-    Raise StoreError for anything else, for a pickle, and for arrays that need too much memory
-    (`check_size`); `name` is the name of the store, for the message.
+    Raise StoreError for anything else, for a pickle, and for arrays that need too much memory (more
+    than 8 GiB, or than half of the machine's memory); `name` is the name of the store, for the
+    message.
     """
     with instead(
         StoreError,
@@ -742,10 +749,11 @@ class StoredVersion:
 def keeps_state(version: int, newest: int, keep: int | None) -> bool:
     """Return whether a version keeps its state when `newest` is the newest version.
 
-    The first version, number 1, and the `keep` newest keep it (None: all do). Of older versions
-    ever fewer do: of the newest hundred those whose number is divisible by 10, of the other ones of
-    the newest thousand those whose number is divisible by 100, and so on. So the number of states
-    grows with the logarithm of the number of versions.
+    A version is a trained model, and its state its stored arrays. The first version, number 1, and
+    the `keep` newest keep it (None: all do). Of older versions ever fewer do: of the newest hundred
+    those whose number is divisible by 10, of the other ones of the newest thousand those whose
+    number is divisible by 100, and so on. So the number of states grows with the logarithm of the
+    number of versions.
     """
     age = newest - version
     if keep is None or version == 1 or age < keep:

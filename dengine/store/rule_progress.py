@@ -46,8 +46,10 @@ def read_rule_progress(
 ) -> RuleProgress:
     """Read from the store how far the decision rule of a version was updated.
 
-    The records that wait in the outbox are written first, if the database takes them in time;
-    nothing else is written. Raises StoreError if the database fails.
+    A decision rule turns bounds of the success probability into an action, and is updated with the
+    outcome of one part after another. A version is a trained model with the state of its rule.
+    Records that were not copied to the database yet are written first, if the database takes them
+    in time; nothing else is written. Raises StoreError if the database fails.
 
     Parameters
     ----------
@@ -61,16 +63,19 @@ def read_rule_progress(
         if it has no label. A check that the version or a stored label counted as overdue stays so,
         whatever `within` is.
     policy_since : int
-        The version with which the present policy came into force. If the newest decision is by an
-        earlier version, no further check becomes overdue by `within`.
+        The version with which the present policy (the tolerated error probability and so on) came
+        into force. If the newest decision is by an earlier version, no further check becomes
+        overdue by `within`.
 
     Returns
     -------
     RuleProgress
-        The newest label that the rule includes, and which decisions count as overdue; of these only
-        those with a lower bound above 0 or an upper one below 1 (`overdue_outcomes`). `last_seq` is
-        0 if there is no version, or if the rule must be rebuilt from all outcomes (see
-        `RuleProgress`).
+        `last_seq` is the number of the newest label that the rule includes. It is 0 if there is no
+        version, or if the rule must be rebuilt from all outcomes: a decision counts as overdue, a
+        label was corrected meanwhile, the stored rule is incomplete, or the version is earlier than
+        `since_version` or of another robot cell. Up to the decision number `overdue_to` a check
+        without a label is overdue. `overdue_ids` are the ids of these decisions, but only of those
+        with a lower bound above 0 or an upper one below 1 (`overdue_outcomes`).
     """
     state = {} if version is None else version.state
     overdue_to = max(

@@ -59,8 +59,9 @@ def _columns(record: type, *names: str, key: str = "") -> list[sa.Column[Any]]:
 def _table(name: str, *parts: Any) -> sa.Table:
     """Return a new table of a cell's rows, with the columns and indexes `parts`.
 
-    Added are `cell_id`, part of the primary key, the number of the row's ledger entry, and the
-    row's sum (`row_sum`).
+    Added are `cell_id`, part of the primary key, the number of the row's entry in the ledger (the
+    cell's hash chain), and the row's checksum (`row_sum`). The table is entered into METADATA, so
+    that it is created in a new database.
     """
     return sa.Table(
         name,
@@ -173,8 +174,9 @@ def prepare_tables(connection: sa.Connection, cell_id: str, name: str) -> None:
     Raises
     ------
     StoreError
-        For an SQLite file of another program, for another version of the schema, if a table or any
-        other column is missing, and if there are the tables of a store, but no cell.
+        For an SQLite file of another program, for another version of the schema, if a table, or a
+        column that is not in `ADDED`, is missing, and if there are the tables of a store, but no
+        cell.
     """
     lock(connection, TABLES)  # two cells may create them at the same moment
     tables = set(sa.inspect(connection).get_table_names())
@@ -218,7 +220,7 @@ def insert_settings(connection: sa.Connection, cell_id: str, settings: Mapping[s
 
 
 def _stored_columns(connection: sa.Connection, table: str) -> set[str]:
-    """Return the names of the columns that a table has in the database; none without a table."""
+    """Return the names of a table's columns in the database; an empty set without the table."""
     inspector = sa.inspect(connection)
     if not inspector.has_table(table):
         return set()

@@ -36,15 +36,15 @@ class SettingTable(CellTable):
         self._database.write(lambda connection: self.replace(connection, settings))
 
     def replace(self, connection: sa.Connection, settings: Mapping[str, str]) -> None:
-        """Put new settings in the place of all present ones of the robot cell; nothing is
-        committed.
+        """Replace all settings of the robot cell by new ones; nothing is committed.
 
         `connection` must be in a write transaction. `settings` holds texts by name; a present
         setting that it lacks is deleted. The settings that the store itself keeps (`RESERVED`)
         stay; raise StoreError if `settings` has one of them. Raise SettingError if another cell of
-        the product would embed traces differently (`check_peer_settings`), or if its recipe or the
-        new one cannot be read. After these errors nothing is changed. A product stays locked
-        (`lock`) until the transaction ends.
+        the product (robot cells that share labels and versions) would embed traces differently
+        (`check_peer_settings`), or if its recipe (settings of its engine) or the new one cannot be
+        read. After these errors nothing is changed. A product stays locked (`lock`) until the
+        transaction ends.
         """
         for key in sorted(settings.keys() & set(RESERVED)):
             raise StoreError(

@@ -130,11 +130,11 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         self._journal: Journal | None = None
 
     def claim_cell(self) -> Journal:
-        """Claim the robot cell for this engine, and open its journal; `close` gives both up.
+        """Lock the robot cell for this engine, and open its journal; `close` gives both up.
 
-        As long as the cell is claimed, no other engine can own it: the journal's file is locked,
-        and on a PostgreSQL server also the cell. A store in memory must not be claimed, which is
-        not checked.
+        As long as it is locked, no other engine can run on the cell: the file of its journal, a log
+        on the local disk, is locked, and on a PostgreSQL server also the cell. Do not call this for
+        a store in memory, which is not checked.
 
         Returns
         -------
@@ -144,9 +144,9 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         Raises
         ------
         StoreError
-            If another engine owns the cell, if the file of its journal is no journal, or if the
-            store or its journal cannot be written; nothing stays claimed. Records that are missing
-            or damaged in the journal are not raised: `Journal.loss` has them.
+            If another engine has locked the cell, if the file of its journal is no journal, or if
+            the store or its journal cannot be written; nothing stays locked. Records that are
+            missing or damaged in the journal are not raised: `Journal.loss` has them.
         """
         in_file = self.database.url.get_backend_name() == "sqlite"
         if in_file:
@@ -189,8 +189,9 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         """Disconnect from the database; a store in memory stays open.
 
         It waits until another thread has finished writing. Then reads and writes raise StoreError.
-        If an engine claimed the robot cell, its journal is closed, too, with the records that the
-        database lacks, and another engine can own the cell. A second call changes nothing.
+        If an engine locked the robot cell (`claim_cell`), its journal (a log on the local disk) is
+        closed, too, and keeps the records that the database lacks; another engine can then own the
+        cell. A second call changes nothing.
         """
         if not self.database.is_in_memory:
             self.database.close()

@@ -144,16 +144,17 @@ def verify_history(
     """Check every row of a store's history; no row is changed, and engines may run meanwhile.
 
     What is wrong is returned as faults, not raised: a row or setting that was changed, added or
-    removed, a decision without its trace or a trace or label without its decision, a table that
-    cannot be read to its end (the cell's decisions, traces and labels are then not compared), a
-    damaged SQLite file, damaged or missing records of a journal, a ledger entry that a cell's
-    journal names and the store lacks, a robot cell that no engine has opened, lost data that nobody
-    has acknowledged (an event says so), and an `expect` that no entry of the checked cells has. At
-    most 20 missing ledger entries of a cell, and 100 findings of SQLite, are returned. A journal
-    that is missing or cannot be read is no fault: `waiting` of the cell is None then. A change of
-    the setting `product`, by which cells share what they learn, is not noticed. The SQLite file of
-    a store that was not in WAL mode is set to it. Takes 40 bytes of memory per row of all cells,
-    the same again for the rows of the cell at hand, and the memory of its ledger entries.
+    removed; a changed or missing entry of a ledger (a robot cell's hash chain), also an entry that
+    the cell's journal (its log on disk) names and the store lacks; a decision without its trace, or
+    a trace or label without its decision; a table that cannot be read to its end (the cell's
+    decisions, traces and labels are then not compared); a damaged SQLite file; damaged or missing
+    records of a journal; a cell that no engine has opened; lost data that nobody has acknowledged
+    (an event says so); and an `expect` that no entry of the checked cells has. At most 20 missing
+    ledger entries of a cell, and 100 findings of SQLite, are returned. A journal that is missing or
+    cannot be read is no fault: `waiting` of the cell is None then. A change of the setting
+    `product`, by which cells share what they learn, is not noticed. The SQLite file of a store that
+    was not in WAL mode is set to it. Takes 40 bytes of memory per row of all cells, the same again
+    for the rows of the cell at hand, and the memory of its ledger entries.
 
     Parameters
     ----------
@@ -162,8 +163,8 @@ def verify_history(
     cell_id : str or None
         The cell; None: all cells.
     expect : str or None
-        A digest of an earlier check, or its first 8 digits or more, that the history must contain.
-        Capital letters and blanks around it do not matter.
+        A digest that an earlier check returned, or its first 8 digits or more; the history must
+        contain it. Capital letters and blanks around it do not matter.
     on_rows : callable, optional
         Called with the number of rows that were just read, for a progress bar: after each 500, and
         at the end of each cell with the rest, which may be 0.
@@ -228,11 +229,12 @@ def verify_history(
 def _inspect_journal(path: Path) -> tuple[list[EntryName], int | None, str]:
     """Read a journal; nothing is raised if it is missing or damaged.
 
-    Return the ledger entries (number and digest) that it and its head, a small file beside it,
-    name, the number of records that its store has not taken, and in words which records are damaged
-    or missing, "" if none is. If there is no journal, or it cannot be read, the only entry is that
-    of the head (none if it has none), the number is None and the text "". If the disk fails while
-    the records are read, OSError is raised.
+    A journal is the log on a robot cell's disk, its head a small file beside it, and the ledger the
+    hash chain of the cell's store. Return three values: the ledger entries (number and digest) that
+    journal and head name; the number of records that the store has not taken; and in words which
+    records are damaged or missing, "" if none is. If there is no journal, or it cannot be read,
+    they are the entry that the head names (none if it names none), None and "". If the disk fails
+    while the records are read, OSError is raised.
     """
     with suppress(StoreError):  # it is missing, damaged, or another user's
         records, journal = read_undrained(path)
@@ -299,14 +301,14 @@ class CellCheck:
         self._is_unreadable = False
 
     def run(self, entries: Sequence[EntryName], loss: str) -> list[HistoryFault]:
-        """Read all rows of the robot cell, and return what is wrong, table by table; [] if nothing
-        is.
+        """Check all rows of the robot cell; return what is wrong, table by table, [] if nothing is.
 
-        The rows of the tables that the ledger chains come first, then the ledger's entries, the
-        settings, events about lost data that nobody has acknowledged, and whether decisions, traces
-        and labels belong together. At the end comes the journal: `loss` says what is damaged in it,
-        "" if nothing is, and `entries` are the ledger entries that it names. Damage is a fault, and
-        so is each of these entries that the ledger lacks.
+        The rows of the tables that the ledger (the cell's hash chain) covers come first, then the
+        ledger's entries, the settings, events about lost data that nobody has acknowledged, and
+        whether decisions, traces and labels belong together. At the end comes the journal, the log
+        on the cell's disk: `loss` says what is damaged in it, "" if nothing is, and `entries` are
+        the ledger entries that it names. Damage is a fault, and so is each of these entries that
+        the ledger lacks.
 
         Fill `digests`, the digests of the ledger's entries, and `rows`, the number of rows read,
         and call `on_rows` with the number of rows just read. A database error is a fault, too, and
@@ -361,14 +363,15 @@ class CellCheck:
     def _check_rows(self, table: str) -> Iterator[HistoryFault]:
         """Yield a fault for each row of a table that was changed or is not in the ledger.
 
-        A row that names no ledger entry is not in the ledger: something beside dengine wrote it. A
-        row was changed if its values do not fit its stored sum. The state of a version has a sum of
-        its own, and a fault of its own; a state that was deleted is no fault. Raise the error of
-        `_read_raw`.
+        The ledger is the store's hash chain, with an entry for each transaction. A row that names
+        no entry is not in the ledger: something beside dengine wrote it. A row was changed if its
+        values do not fit its stored checksum. The state of a version (its stored arrays) has a
+        checksum of its own, and a fault of its own; a state that was deleted is no fault. Raise
+        SQLAlchemy's DatabaseError, also after some faults, if the table cannot be read to its end.
 
-        The sums of every row with an entry, also of a changed one, are kept for `_check_ledger`.
-        Each row adds 1 to `rows`. After every 500th row (CHUNK) `on_rows` is called with 500; `run`
-        calls it once more with the number of the rows that are left.
+        The stored checksums of every row with an entry, also of a changed one, are kept for
+        `_check_ledger`. Each row adds 1 to `rows`. After every 500th row (CHUNK) `on_rows` is
+        called with 500; `run` calls it once more with the number of the rows that are left.
         """
         for row in self._read_raw(table):
             self.rows += 1
@@ -393,12 +396,14 @@ class CellCheck:
     def _check_ledger(self) -> Iterator[HistoryFault]:
         """Yield a fault for each ledger entry that was changed or is missing; fill `digests`.
 
-        `digests` gets the digest of each entry, hexadecimal, oldest first. An entry must fit the
-        digest of the entry before, and the sums of its rows as they are stored: that a row does not
-        fit its sum is a fault of its own. All rows must be checked first (`_check_rows`). After an
+        The ledger is the store's hash chain, with an entry for each transaction. `digests` gets the
+        digest of each entry, hexadecimal, oldest first. An entry must fit the digest of the entry
+        before, and the checksums of its rows as they are stored: that a row does not fit its
+        checksum is a fault of its own. All rows must be checked first (`_check_rows`). After an
         entry that was changed, only this entry is a fault; the entry behind a missing one is a
         fault, too. Only the first 20 missing entries are yielded; those behind the newest that an
-        entry or a row names cannot be noticed. Raise the error of `_read_raw`.
+        entry or a row names cannot be noticed. Raise SQLAlchemy's DatabaseError if the ledger
+        cannot be read to its end.
         """
         sums = {}
         for table, packed in self._sums.items():
@@ -434,11 +439,11 @@ class CellCheck:
     def _check_settings(self) -> Iterator[HistoryFault]:
         """Yield a fault for each setting that was changed, or is only in the table or the ledger.
 
-        The ledger has a copy of the cell's settings, but not of those that the store itself keeps
-        (`RESERVED`), so a change of these is no fault here. A damaged or missing copy counts as
-        empty. If the setting with the version of the tables is missing (no engine has opened the
-        robot cell), that is a fault, too. Raise SQLAlchemy's DatabaseError if a table cannot be
-        read.
+        The ledger, the store's hash chain, has a copy of the cell's settings, but not of those that
+        the store itself keeps (`RESERVED`), so a change of these is no fault here. A damaged or
+        missing copy counts as empty. If the setting with the version of the tables is missing (no
+        engine has opened the robot cell), that is a fault, too. Raise SQLAlchemy's DatabaseError if
+        a table cannot be read.
         """
         stored = read_settings(self.connection, self.cell_id)
         copies = (
@@ -486,9 +491,11 @@ class CellCheck:
 def _entry_fault(added: Any, sums: Mapping[str, list[bytes]]) -> str:
     """Return in words why a ledger entry does not fit its rows.
 
-    It compares the numbers of rows by table; if they are equal, it says that the entry or its rows
-    were changed. `added` is the entry's column of that name, the numbers in JSON; if it is damaged,
-    all are 0. `sums` has the sums of the rows that are there, by table.
+    The ledger is the store's hash chain, with an entry for each transaction. If the numbers of rows
+    by table differ, the text names both; else it says that the entry or its rows were changed.
+    `added` is the entry's column of that name: JSON with the number of rows that were added to each
+    table; if it is damaged, all are 0. `sums` has the checksums of the rows that are there, by
+    table.
     """
     counts = Counter[str](parse_object(added))
     present = Counter({table: len(rows) for table, rows in sums.items()})

@@ -95,7 +95,8 @@ class VersionTable(CellTable):
 
         `last_seq` is the number of the newest label that the retrain knew of. `state` is None, or
         the arrays by name; `now` is the time of the row, in seconds since 1970. Raise StoreError if
-        `report.accepted` is True and `state` is None, and for an array of Python objects.
+        `report.accepted` is True (the version is to be put in force) and `state` is None, and for
+        an array of Python objects.
         """
         arrays = check_state(report, state)
         blob = None if arrays is None else to_npz(arrays)
@@ -109,13 +110,14 @@ class VersionTable(CellTable):
     def insert(self, connection: sa.Connection, row: Row) -> int:
         """Insert the row of a retrain; return the number of its version. Nothing is committed.
 
-        The retrain and its version are numbered apart. The retrain gets the next number of the
-        robot cell or its product; the product is then locked until the transaction ends.
-        `row["version"]` is the number that the caller wants for the version. If the version is not
-        put in force (`accepted` of the row is False), it has that number, and nothing else is done.
-        Otherwise it gets the number after the newest version of cell and product if the number
-        wanted is taken, and the states of older versions of cell and product that `keeps_state`
-        does not keep are deleted.
+        A version is the model that a retrain made; both are numbered, apart. The retrain gets the
+        next number of the robot cell or its product (robot cells that share labels and versions);
+        the product is then locked until the transaction ends. `row["version"]` is the number that
+        the caller wants for the version. If the version is not put in force (`accepted` of the row
+        is False), it has that number, and nothing else is done. Otherwise it gets the larger of
+        that number and the number after the newest version of cell and product. The states (stored
+        arrays) of older versions of cell and product that `keeps_state` does not keep are then
+        deleted.
         """
         number: int = row["version"]
         if row["accepted"]:
@@ -151,15 +153,17 @@ class VersionTable(CellTable):
     def newest(self) -> ModelVersion | None:
         """Return the newest version that was put in force in the robot cell or its product.
 
-        It comes with its arrays. If they are missing or damaged, an event is written to the store
-        (once for each such version), or logged if the store cannot be written, and the next older
-        version whose arrays are kept and intact is returned.
+        A product is robot cells that share labels and versions. The version, a trained model, comes
+        with its arrays. If they are missing or damaged, an event (a row of the store's log) is
+        written to the store (once for each such version), or logged if the store cannot be written,
+        and the next older version whose arrays are kept and intact is returned.
 
         Returns
         -------
         ModelVersion or None
             None if there is no version yet, and if all arrays that are kept are damaged. The
-            version of another cell is returned without the state of its rule.
+            version of another cell is returned without the state of its decision rule, which
+            learned from that cell's outcomes.
 
         Raises
         ------
@@ -178,6 +182,8 @@ class VersionTable(CellTable):
     def load(self, version: int) -> ModelVersion:
         """Return a version that was put in force in the robot cell or its product, with its arrays.
 
+        A version is a trained model, and a product is robot cells that share labels and versions.
+
         Parameters
         ----------
         version : int
@@ -185,7 +191,8 @@ class VersionTable(CellTable):
         Returns
         -------
         ModelVersion
-            The version of another cell is returned without the state of its rule.
+            The version of another cell is returned without the state of its decision rule, which
+            learned from that cell's outcomes.
 
         Raises
         ------
@@ -212,8 +219,9 @@ class VersionTable(CellTable):
         """Return the version that the retrain with this number made, with its arrays.
 
         There must be such a retrain. A version of another robot cell is returned without the state
-        of its rule, and its `rule_last_seq` is 0: the rule includes no label. Raise VersionError if
-        the state is missing or damaged.
+        of its decision rule, which learned from that cell's outcomes, and its `rule_last_seq` is 0:
+        the rule includes no label. Raise VersionError if the state, the stored arrays, is missing
+        or damaged.
         """
         query = sa.select(*VERSION.c["cell_id", "version", "last_seq", "state", "state_sum"]).where(
             self._scope.shared(VERSION.c.cell_id), VERSION.c.retrain == retrain
@@ -233,7 +241,8 @@ class VersionTable(CellTable):
     def all(self, cell_only: bool = False) -> list[StoredVersion]:
         """Return every retrain of the robot cell or its product, oldest first.
 
-        Retrains whose version was dropped (not put in force) are included. No arrays are read.
+        A product is robot cells that share labels and versions. Retrains whose version (the trained
+        model) was dropped, not put in force, are included. No arrays are read.
 
         Parameters
         ----------
@@ -243,8 +252,9 @@ class VersionTable(CellTable):
         Returns
         -------
         list of StoredVersion
-            Each with the report, the time, and whether the arrays of its version are kept; whether
-            these are intact is not checked.
+            Each with the report, the time, the newest label that the retrain knew of, and whether
+            the arrays of its version are kept, and their size; whether they are intact is not
+            checked.
 
         Raises
         ------
@@ -270,12 +280,12 @@ class VersionTable(CellTable):
         return [version.report for version in self.all()]
 
     def _accepted_query(self) -> sa.Select[Any]:
-        """Return the query for the versions of the robot cell or its product that were put in
-        force.
+        """Return the query for the versions that were put in force in the cell or its product.
 
-        The rows are newest first. The columns are `retrain`, the number among all retrains
-        (those that were dropped are numbered, too), `version`, the number of the version, and
-        `kept`, whether its state is kept.
+        The query is not run. A product is robot cells that share labels and versions. The rows are
+        newest first. The columns are `retrain`, the number among all retrains (those whose version
+        was not put in force are numbered, too), `version`, the number of the version, and `kept`,
+        whether its state (the stored arrays) is kept.
         """
         return (
             sa.select(*VERSION.c["retrain", "version"], VERSION.c.state.is_not(None).label("kept"))

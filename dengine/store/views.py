@@ -121,11 +121,11 @@ class DecisionGroup:
     def label(self) -> str:
         """The corrected label in a word: good, bad, forgotten, overdue or none.
 
-        "forgotten": there is a label, but a correction withdrew it.
-        "overdue": a check was asked for, there is no label, and so many decisions followed that the
-        check is overdue (`aged`, which is False if the tally was made without `within`). "none":
-        there is no label, and no check is overdue. A check of a quarantined trace (stored, but
-        never used in training) is never overdue.
+        "good" and "bad" are the label after corrections. "forgotten": there is a label, but a
+        correction withdrew it. "overdue": a check was asked for, there is no label, and so many
+        decisions followed that the check is overdue (`aged`; it is False if the decisions were
+        counted without the number `within`). "none": there is no label, and no check is overdue. A
+        check of a quarantined trace (stored, but never used in training) is never overdue.
         """
         if self.source is not None and self.success is None:
             return "forgotten"
@@ -169,14 +169,17 @@ class Tally:
 
     @property
     def outcomes(self) -> Outcomes:
-        """Counts of parts by action and corrected label, for the certificate (an error bound).
+        """Counts of parts by action and corrected label, for a certificate (a bound on errors).
 
-        An audited part (checked though the model was certain) is counted by what the model alone
-        would have done, in the fields of audits alone and not among the accepted and rejected
-        parts: `audited_accepts` and `audited_rejects` are the audits with the label good or bad.
-        Audits with the label forgotten (withdrawn) or overdue (not reported in time) have fields of
-        their own, and audits with the label none are in no field. A part that an operator's limits
-        rejected (`Reason.OUTSIDE`) is not counted as rejected or false reject.
+        Accepted parts with the label good are `confirmed`, those with the label bad
+        `false_accepts`, and rejected parts with the label good `false_rejects`. An audited part
+        (checked, though the model would have accepted or rejected it) is counted by what the model
+        alone would have done, in the fields of audits alone and not among the accepted and rejected
+        parts: `audited_accepts` and `audited_rejects` are the audits with the label good or bad,
+        `audited_accepts_bad` and `audited_rejects_good` the wrong ones of these. Audits with the
+        label forgotten (withdrawn) or overdue (not reported in time) have fields of their own, and
+        audits with the label none are in no field. A part that an operator's limits rejected
+        (`Reason.OUTSIDE`) is not counted as rejected or false reject.
         """
         actions = Counter[Action]()
         by_action = Counter[tuple[Action, str]]()

@@ -56,9 +56,10 @@ def read_sensor(
     """Return what the sensor reports of a true force.
 
     The force passes a low-pass filter of first order, which starts at 0, gets noise, ripple (a
-    sine), bias and drift, and is rounded to multiples of the fault `step_n`. The drift grows
-    linearly to its full value at the last sample. Then samples are lost: a lost sample repeats the
-    last sample that was not lost. The first is never lost. `rng` is advanced.
+    sine), bias and drift, and is rounded to multiples of `faults.step_n`. The drift grows linearly
+    to its full value at the last sample. Then samples are lost, each with the probability
+    `faults.dropped_share`, but never the first: a lost sample repeats the last sample that was not
+    lost. `rng` is advanced.
 
     Parameters
     ----------
@@ -69,8 +70,8 @@ def read_sensor(
     parameters : CellParameters
         Only `bandwidth_hz` is used.
     rng : numpy.random.Generator
-        Draws the noise, the phase of the ripple, and which samples are lost, and numbers that are
-        not used.
+        Draws the noise, the phase of the ripple, which samples are lost, and numbers that are not
+        used.
 
     Returns
     -------
@@ -144,6 +145,8 @@ def insert_once(
     Returns
     -------
     SimulatedInsertion
+        Its `success` says whether the height of the part's top differs from the nominal one by at
+        most `parameters.height_tolerance_mm`.
 
     Raises
     ------
@@ -177,14 +180,15 @@ def insert_once(
 
 
 def _find_cause(conditions: Conditions, pushed: Push) -> str:
-    """Return the cause of a failed insertion, one of `CAUSES` but "none".
+    """Return the cause of a failed insertion, one of `CAUSES` except "none".
 
-    `conditions` are those that were drawn, and `pushed` is what came of them. If a missed grasp or
-    a wrong part was drawn, that is the cause. Debris that was drawn is the cause if the part's tip
-    stopped below the rim of the hole and its chamfer, at most `SLIP_MM` above the debris. Otherwise
-    the cause is "slip" if the part slid up by more than `SLIP_MM` in the gripper, and else where
-    its tip stopped: "rim_contact" on the chamfer, on the rim or above it, "stuck" at most
-    `STUCK_MM` above the seat (the floor of the hole), "wedging" in between.
+    `conditions` are those that were drawn, and `pushed` is what came of them. The first rule that
+    applies decides. If a missed grasp or a wrong part was drawn, that is the cause. If the part's
+    tip stopped on the chamfer of the hole or higher, the cause is "slip" if the part slid up by
+    more than `SLIP_MM` (1 mm) in the gripper, else "rim_contact". It is "debris" if debris was
+    drawn and the tip stopped at most `SLIP_MM` above it, "slip" if the part slid up by more than
+    `SLIP_MM`, "stuck" if the tip stopped at most `STUCK_MM` (4 mm) above the floor of the hole, and
+    else "wedging".
     """
     tip_mm = pushed.height_mm - conditions.extra_length_mm  # of the part's tip above the seat
     if conditions.fault in ("missed_grasp", "wrong_part"):
@@ -265,10 +269,11 @@ class SimulatedCell:
     def insert(self) -> TraceArray:
         """Pick a part, push it into the fixture, and return the force, float32 of shape (1000,).
 
-        The force is in newtons, 2 s at 500 Hz. `last` becomes this insertion, and `clock` goes on
-        by `cycle_s` seconds, a setting of the robot cell. Raise DengineError if the last part still
-        waits for verify, proceed or reject, or if MuJoCo is not installed, and SettingError,
-        ValueError or OverflowError for settings that cannot be simulated; nothing changes then.
+        The force is in newtons, 2 s at 500 Hz. `last` becomes this insertion, with its label, and
+        `clock` goes on by `cycle_s` seconds, a setting of the robot cell. Raise DengineError if the
+        last part still waits for verify, proceed or reject, or if MuJoCo is not installed, and
+        SettingError, ValueError or OverflowError for settings that cannot be simulated; nothing
+        changes then.
         """
         if self._waiting:
             raise DengineError(
@@ -297,10 +302,10 @@ class SimulatedCell:
         """Pass the part on without a check; return what became known of it.
 
         A bad part stops the line: the result is STOPPED, and `clock` goes on by `stop_s` seconds.
-        But with the probability `unreported_share` nothing becomes known of a bad part (UNKNOWN).
-        Both are fields of `CellParameters`. Nothing becomes known of a good part. The same seed and
-        cycle have the same result. Afterwards no part waits. Raise DengineError if no part waits
-        for a decision.
+        But with the probability `unreported_share` nobody notices it: the result is UNKNOWN, and
+        `clock` stays. Both numbers are fields of `CellParameters`. For a good part the result is
+        always UNKNOWN. The same seed and cycle have the same result. Afterwards no part waits.
+        Raise DengineError if no part waits for a decision (verify, proceed or reject).
         """
         success = self._take_waiting("proceed").success
         # It depends on the part alone.
@@ -318,7 +323,7 @@ class SimulatedCell:
         self._take_waiting("reject")
 
     def _take_waiting(self, call: str) -> SimulatedInsertion:
-        """Return the insertion that waits for a decision; afterwards none waits.
+        """Return the insertion that waits for verify, proceed or reject; afterwards none waits.
 
         `call` is the method's name, for the DengineError that is raised if none waits.
         """

@@ -186,10 +186,11 @@ _DRAWN_BY: dict[str, str | Range] = {
 def draw_conditions(parameters: CellParameters, rng: np.random.Generator) -> Conditions:
     """Draw the conditions of one insertion, its fault included; `rng` is advanced.
 
-    Every quantity is drawn each time, even if it is not used, so that another range for one
-    quantity does not change the others. At most one fault is drawn (missed grasp, weak grip, debris
-    or wrong part); its values replace the normal ones, for example a weak grip the normal grip. A
-    missed grasp replaces no value: only the field `fault` says so.
+    A range is drawn uniformly; a setting with `_sd` in its name is the standard deviation of a
+    normal draw around 0. Every quantity is drawn each time, even if it is not used, so that another
+    range for one quantity does not change the others. At most one fault is drawn (missed grasp,
+    weak grip, debris or wrong part); its values replace the normal ones, for example a weak grip
+    the normal grip. A missed grasp replaces no value: only the field `fault` says so.
 
     Parameters
     ----------
@@ -205,6 +206,8 @@ def draw_conditions(parameters: CellParameters, rng: np.random.Generator) -> Con
     ValueError
         For a range whose first number is larger than its second, a negative standard deviation, or
         probabilities of faults that are negative or add up to more than 1.
+    OverflowError
+        For a range that is not finite.
     """
 
     def draw(setting: str | Range) -> float:
@@ -257,10 +260,10 @@ def wear(parameters: CellParameters, cycle: int, cycles: int) -> CellParameters:
 def variant(parameters: CellParameters, cycle: int, cycles: int) -> CellParameters:
     """Return the parameters of a cycle: unchanged in the first half, then those of another part.
 
-    `cycle` counts from 0, and `cycles` is their number; of an odd number the first half is the
-    smaller one. The other part is 2.5 times as heavy. Its clearance in the hole will be drawn from
-    0.04 to 0.16 mm, and the chamfer of the hole from 0.5 to 1.0 mm, whatever the parameters say;
-    both are smaller than by default. Nothing is drawn here.
+    `cycle` counts from 0, and `cycles` is their number; if it is odd, the first half is the smaller
+    one. The other part is 2.5 times as heavy. Its clearance (width of the hole minus width of the
+    part) will be drawn from 0.04 to 0.16 mm, and the chamfer of the hole from 0.5 to 1.0 mm,
+    whatever the parameters say; both are smaller than by default. Nothing is drawn here.
     """
     if cycle < cycles // 2:
         return parameters

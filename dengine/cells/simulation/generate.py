@@ -36,7 +36,7 @@ def simulate(
         Number of cycles, one insertion in each.
     seed : int, default 0
     scenario : str, default "nominal"
-        A name in `SCENARIOS`.
+        What changes in the course of the cycles, a name in `SCENARIOS`; "nominal": nothing.
     n_jobs : int, default -1
         Number of processes; -1: one for each core. It changes no result. `joblib.parallel_config`
         chooses the backend.
@@ -80,8 +80,9 @@ def save_insertions(
     """Write insertions as a compressed .npz file that `load_dataset` reads; return its path.
 
     The folder is created if it is missing, and the file is written in full or not at all. The
-    arrays are X int16 (n, 1000), scale, y int8 (n,), rate_hz and unit. X * scale are the traces in
-    newtons: they are rounded to multiples of `scale`, which is 0.01 N or more.
+    arrays are X int16 (n, 1000), scale, y int8 (n,) with 1 for a good part and 0 for a bad one,
+    rate_hz and unit. X * scale are the traces in newtons, rounded to multiples of `scale`, which is
+    0.01 N or more.
 
     Parameters
     ----------
@@ -90,7 +91,7 @@ def save_insertions(
     insertions : sequence of SimulatedInsertion
         At least one; ValueError if there is none.
     force : bool, default False
-        Replace a file that exists; never a database, a folder or a link.
+        Whether a file that exists is replaced; a database, a folder or a link never is.
 
     Returns
     -------
@@ -99,7 +100,8 @@ def save_insertions(
     Raises
     ------
     OutputError
-        If the file exists, without `force`, or must not or cannot be written.
+        If the file exists and `force` is False, or is one that is never replaced, or cannot be
+        written.
     """
     buffer = BytesIO()
     X = np.stack([insertion.trace for insertion in insertions])

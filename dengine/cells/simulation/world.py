@@ -53,8 +53,9 @@ class Push:
 def push(conditions: Conditions, time_step_s: float = TIME_STEP_S) -> Push:
     """Lower the gripper with the part into the fixture for 2 s; return what came of it.
 
-    The gripper goes down to a target below the seat (the floor of the hole), and moves back while
-    the force is above its limit. The force is recorded at 500 Hz. The simulation has no randomness.
+    The gripper goes down to a target below the floor of the hole, and moves back while the force is
+    above `conditions.force_limit_n`. The force is recorded at 500 Hz. The simulation has no
+    randomness.
 
     Parameters
     ----------
@@ -65,6 +66,8 @@ def push(conditions: Conditions, time_step_s: float = TIME_STEP_S) -> Push:
     Returns
     -------
     Push
+        The force, 1000 samples in newtons, the height of the part's top above its nominal seated
+        height, and how far the part slid up in the gripper, in mm.
 
     Raises
     ------
@@ -134,7 +137,7 @@ def _drive(mujoco: Any, model: Any, data: Any, conditions: Conditions, steps: in
 
 
 def cell_xml(c: Conditions, time_step_s: float = TIME_STEP_S) -> str:
-    """Return the MuJoCo model of the whole robot cell under the conditions `c`, as text in MJCF.
+    """Return the MuJoCo model of the whole robot cell under the conditions `c`, as XML (MJCF).
 
     It has the fixture, the carriage, which a drive moves up and down, the elastic wrist with the
     force sensor, and the part, unless the grasp missed it. `time_step_s` is the step of the physics
@@ -188,7 +191,7 @@ def _spring(stiffness: float, inertia: float) -> str:
 
 
 def _part_xml(c: Conditions) -> str:
-    """Return the MuJoCo body (MJCF, as text) of the part in the gripper.
+    """Return the part in the gripper as a body of MuJoCo, a text in its XML (MJCF).
 
     It is "" if the grasp missed the part. Dry friction holds the part in the gripper until the
     force of the push exceeds `c.grip_n` newtons; then it slides, by at most about 12 mm up or down.
@@ -214,7 +217,7 @@ def _part_xml(c: Conditions) -> str:
 
 
 def _fixture_xml(c: Conditions) -> str:
-    """Return the part of MuJoCo's model (MJCF, as text) that is the fixture.
+    """Return the fixture of the MuJoCo model as a text in its XML (MJCF).
 
     It has four walls with a chamfer of 45° around a square hole, a floor, and debris, a soft box on
     the floor, only if its thickness in the conditions `c` is above 0. The rim is at z = 0. Angles
@@ -236,7 +239,7 @@ def _fixture_xml(c: Conditions) -> str:
 
 
 def _wall_xml(side: int, half: float, chamfer: float, depth: float) -> str:
-    """Return one wall of the fixture's square hole as text in MuJoCo's MJCF.
+    """Return one wall of the fixture's square hole as a text in MuJoCo's XML (MJCF).
 
     A wall is three boxes, one of which is the chamfer. Wall 0 is at +x; wall `side` (0 to 3) is
     turned by `side` quarter turns about z. The half width `half` of the hole, the width of the

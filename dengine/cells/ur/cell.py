@@ -160,13 +160,14 @@ class UrCell(AbstractContextManager["UrCell"]):
     def insert(self) -> TraceArray:
         """Have the robot insert a part, wait for that, and return the trace, (T,) or (C, T).
 
-        Lost samples are NaN. All samples are NaN if no insertion was seen, for example because its
-        start was lost or the trigger is wrong; one that is not complete when the time for the order
-        is over has NaN for the rest. `last` becomes the record of this insertion (trace and missing
-        samples); a trace with missing samples is counted in `incomplete`. Raise CellError if the
-        robot does not answer in time, fails, or its program stops; `last` is then None, or the
-        insertion if it was complete before, or as much of it as came before a restart of the
-        controller, and nothing is counted.
+        Lost samples are NaN. All samples are NaN if no insertion was seen, for example because the
+        samples at its start were lost, or because the trigger (the condition on the robot's values
+        that begins a recording) was never met. An insertion that is not complete when the time for
+        the order, `order_timeout`, is over has NaN for the rest. `last` becomes the record of this
+        insertion (its trace, and the number of missing samples), and `incomplete` counts the traces
+        with missing samples. Raise CellError if the robot does not answer in this time or reports a
+        failure, or its program stops. Then nothing is counted, and `last` is None, or the insertion
+        if it was complete before, or as much of it as came before a restart of the controller.
         """
         self._execute_order(Verb.INSERT)
         if self.last is None:  # the start was lost, or the trigger is wrong
@@ -201,13 +202,14 @@ class UrCell(AbstractContextManager["UrCell"]):
         """Send an order (`verb`) to the robot, wait for its result, and return the result.
 
         The order gets the next number; after 200,000,000 comes 1. This call waits at most
-        `order_timeout` seconds. Packages that were received before are discarded. If there is no
-        connection, or it is lost meanwhile, the order is written at the first package of the next
-        connection, unless the order is 10 s old by then or the controller was restarted: a robot
-        must not move when nobody expects it. The order INSERT also waits, within the same time, for
-        the end of a trace that has begun. It sets `last` to the insertion, which a restart of the
-        controller cuts short, or to None if none was complete by then. Raise CellError if the robot
-        does not answer in time, fails, or its program stops.
+        `order_timeout` seconds. Packages (the values that the robot sends at once) that were
+        received before are discarded. If there is no connection, or it is lost meanwhile, the order
+        is written at the first package of the next connection, unless the order is 10 s old by then
+        or the controller was restarted: a robot must not move when nobody expects it. The order
+        INSERT also waits, within the same time, for the end of a trace that has begun. It sets
+        `last` to the insertion, which a restart of the controller cuts short, or to None if none
+        was complete by then. Raise CellError if the robot does not answer in time, reports a
+        failure or a result that this order cannot have, or if its program stops.
         """
         newest = self.recorder.arm()  # discards what was received between orders
         self._number = self._number % MAX_NUMBER + 1
@@ -251,9 +253,10 @@ class UrCell(AbstractContextManager["UrCell"]):
     def _find_result(self, row: Row, verb: Verb) -> ResultCode | None:
         """Return the result of the present order (`verb`) if the package `row` holds it, else None.
 
-        Raise CellError if the result is FAILED, VOID (the program was started anew) or one that
-        this order cannot have, or if the robot's program has stopped and this package holds no
-        result.
+        A package is the values that the robot sends at once. It holds the result if the number in
+        its register of results is that of the order. Raise CellError if the result is FAILED, VOID
+        (the program was started anew) or one that this order cannot have, or if the robot's program
+        has stopped and this package holds no result.
         """
         number, code = divmod(int(row.values[ANSWER]), 10)
         if number == self._number:
@@ -270,12 +273,12 @@ class UrCell(AbstractContextManager["UrCell"]):
         )
 
     def _wait_until_ready(self) -> int:
-        """Wait until the robot's program runs and has answered its last order; return the number of
-        this order.
+        """Wait until the robot's program is ready; return the number of its last order.
 
-        Packages that arrive before are discarded. The numbers of the order and of the result in
-        the registers must be equal. Raise CellError after `start_timeout` seconds; its message says
-        whether the robot sent nothing, its program does not run, or it has not answered.
+        It is ready if it runs and has answered its last order: the numbers of the order and of the
+        result in the registers must be equal. Packages (the values that the robot sends at once)
+        that arrive before are discarded. Raise CellError after `start_timeout` seconds; its message
+        says whether the robot sent nothing, its program does not run, or it has not answered.
         """
         problem = ""
         for row in self.recorder.stream.rows(self.start_timeout):

@@ -86,8 +86,9 @@ class PackageReader:
     def feed(self, piece: bytes) -> Iterator[Package]:
         """Add bytes, and yield every package that is complete; an incomplete rest is kept.
 
-        Nothing is added before the iteration begins. Raise CellError for bytes that are no RTDE
-        package; packages before them have been yielded, and every later call raises it again.
+        Nothing is added before the iteration begins. Raise CellError for bytes that are no package
+        of RTDE, the protocol of the robot controller; packages before them have been yielded, and
+        every later call raises it again.
         """
         self._bytes += piece
         while len(self._bytes) >= HEADER.size:
@@ -125,9 +126,10 @@ class RtdeRecipe:
 
     @cached_property
     def columns(self) -> tuple[str, ...]:
-        """Name of each value of a data package, cached.
+        """Names of the values in a data package, in their order, cached.
 
-        It is like `timestamp`, or like `actual_TCP_force[2]` for an element of a vector.
+        A single value has the name of its field, like `timestamp`, and an element of a vector a
+        name like `actual_TCP_force[2]`.
         """
         sizes = [len(TYPES[field_type]) for field_type in self.types]
         fields = zip(self.names, sizes, strict=True)
@@ -151,9 +153,11 @@ class RtdeRecipe:
         return Package(PackageType.DATA, self.layout.pack(self.number, *numbers)).to_bytes()
 
     def unpack(self, payload: bytes) -> dict[str, float]:
-        """Return the values in the payload of a data package by column, the name of the value.
+        """Return the values in the payload of a data package: a dict of numbers by their names.
 
-        Raise CellError for a package of another size, or of another RTDE recipe (list of fields).
+        A name is like `timestamp`, or like `actual_TCP_force[2]` for an element of a vector. Raise
+        CellError for a package of another size, or of another RTDE recipe (a numbered list of
+        fields).
         """
         if len(payload) != self.layout.size or payload[0] != self.number:
             number = payload[0] if payload else "none"
@@ -167,7 +171,8 @@ class RtdeRecipe:
 def read_recipe(payload: bytes, names: Sequence[str], direction: str) -> RtdeRecipe:
     """Return the RTDE recipe (a numbered list of fields and their types) that a controller made.
 
-    The recipe is its response to a request for fields.
+    RTDE is the protocol of the robot controller. The recipe is its response to a request for
+    fields.
 
     Parameters
     ----------
@@ -188,7 +193,7 @@ def read_recipe(payload: bytes, names: Sequence[str], direction: str) -> RtdeRec
         If the controller does not have a field or gives it a type that is not in `TYPES`, or the
         response has another number of types.
     HeldError
-        If another client writes a field.
+        If another client of the controller writes a field.
     """
     types = tuple(payload[1:].decode("ascii", errors="replace").split(",")) if payload else ()
     expect(

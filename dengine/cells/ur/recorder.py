@@ -147,8 +147,9 @@ class RtdeRecorder(AbstractContextManager["RtdeRecorder"]):
     def record(self, timeout: float = 60.0) -> InsertionRecord:
         """Wait for the next insertion after the last one, or after a call of `arm`, and return it.
 
-        It may have begun before this call: the packages of the last 60 s are buffered. What came
-        earlier and was not read is lost.
+        It begins when the trigger, a condition on the values that the controller sends, is met. It
+        may have begun before this call: the packages (the values sent at once) of the last 60 s are
+        buffered. What came earlier and was not read is lost, and `arm` discards what has come.
 
         An insertion that is not complete after `timeout` seconds, for example because the
         controller fell silent, is returned with NaN for the missing samples. If packages are
@@ -188,8 +189,9 @@ class RtdeRecorder(AbstractContextManager["RtdeRecorder"]):
     def feed(self, row: Row) -> InsertionRecord | None:
         """Add a package of the stream, `row`; return the insertion that it completes, else None.
 
-        An insertion begins when the trigger goes on after it was off for `quiet_s` seconds. It is
-        complete with the first package of the time of its last sample, less half a step, or later.
+        An insertion begins when the trigger (a condition on the values of a package) is met after
+        it was not met for `quiet_s` seconds. It is complete with the first package whose time is
+        that of its last sample, less half the time between two samples, or later.
 
         Samples that were lost are NaN in the trace; all samples are NaN if packages are missing
         where the insertion began, so that its start is unknown. If the clock of the controller went
@@ -218,7 +220,8 @@ class RtdeRecorder(AbstractContextManager["RtdeRecorder"]):
 
         Samples that did not come are NaN. All samples are NaN if packages are missing where the
         insertion began, so that its start is unknown, or if no insertion has begun. The recorder
-        then looks for the next one; a trigger that is on begins none until it was off.
+        then looks for the next one; a trigger (the condition that begins an insertion) that is on
+        begins none until it was off.
         """
         start = self._start
         first = self._first_time()

@@ -168,11 +168,11 @@ class RtdeClient:
             self._socket.sendall(data)
 
     def _receive_packages(self) -> Iterator[Package]:
-        """Yield packages as they arrive, without an end; text messages of the controller are left
-        out.
+        """Yield packages as they arrive, without an end, but no text messages of the controller.
 
         The newest text message is kept, for errors to quote. Raise CellError if the connection is
-        lost or silent for the `timeout` of the client, or for bytes that are no RTDE.
+        lost or silent for the `timeout` of the client, or for bytes that are no RTDE, the protocol
+        of the controller.
         """
         packages = PackageReader()
         while True:
@@ -278,7 +278,7 @@ class RtdeStream:
         self._thread.start()
 
     def close(self) -> None:
-        """Close the connection, and wait until the thread has ended; safe to call again.
+        """Close the connection, and wait until the receiving thread has ended; safe to call again.
 
         Buffered packages stay, and `rows` yields them before it ends.
         """
@@ -337,9 +337,9 @@ class RtdeStream:
     def _read_loop(self) -> None:
         """Receive packages and buffer them until the stream is closed: the body of the thread.
 
-        If the connection is lost, or its bytes are no RTDE, it reconnects, as often as that takes,
-        and counts each new connection. While there is no connection, the attribute `trouble` says
-        why.
+        If the connection is lost, or its bytes are no RTDE (the protocol of the controller), it
+        reconnects, as often as that takes, and counts each new connection. While there is no
+        connection, the attribute `trouble` says why.
         """
         while self._client is not None:
             client = self._client
@@ -362,14 +362,13 @@ class RtdeStream:
                         new_client.close()
 
     def _count_and_buffer(self, row: Row) -> None:
-        """Count a package and the packages missing before it, buffer it, and wake who waits in
-        `rows`.
+        """Count a package and those missing before it, buffer it, and wake whoever waits in `rows`.
 
         `row` is the package. Raises CellError, and changes nothing, if its time is not finite.
-        Times are compared in whole steps of 1 / rate, rounded. A package with the same time as the
-        package before also counts as repeated, and a package with an earlier time counts as a
-        restart of the controller; both are buffered, too. If the buffer is full, its oldest package
-        is dropped, which is not counted.
+        Times are compared in steps of 1 / rate, rounded to whole steps; each step without a package
+        counts as missing. A package with the same time as the package before also counts as
+        repeated, and a package with an earlier time counts as a restart of the controller; both are
+        buffered, too. If the buffer is full, its oldest package is dropped, which is not counted.
         """
         expect(
             math.isfinite(row.timestamp / self.step),
