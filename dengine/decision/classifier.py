@@ -58,9 +58,10 @@ class WilsonRadiusClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[mi
     def fit(self, Z: ArrayLike, y: ArrayLike) -> Self:
         """Make these embeddings the references (labelled points), in place of all earlier ones.
 
-        It sets `classes_`, the sorted classes, of which the last is the success, `index_`, which
-        holds the references, and `neighbours_`, which decides by them. A lone class 0, False or -1
-        counts as failure, any other lone class as success.
+        It sets `classes_`, the sorted classes, `index_`, which holds the references, and
+        `neighbours_`, the module that counts the references around a point and decides. Of two
+        classes the last is the success. A single class is the failure if it is 0, False or -1, and
+        otherwise the success.
 
         Parameters
         ----------
@@ -139,8 +140,8 @@ class WilsonRadiusClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[mi
         Returns
         -------
         array of float64, shape (n, 2)
-            Rate of failure, rate of success, in the order of `classes_`; 0.5 each without
-            neighbours. Ones, of shape (n, 1) if `classes_` has one class.
+            Rate of failure, rate of success, in the order of `classes_`; 0.5 each if no label is
+            within the radius. If `classes_` has one class, the array is all ones, of shape (n, 1).
         """
         n_success, n_failure = self.count(Z)
         n = n_success + n_failure
@@ -196,8 +197,9 @@ class WilsonRadiusClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[mi
 
         Returns float64 (n, 5), with the columns `ActionCode` (0 verify, 1 accept, 2 reject), lower,
         upper (bound on the success probability), n_success and n_failure (labels within the
-        radius). Raises NotFittedError before `fit`, and ValueError for arrays that scikit-learn
-        refuses (TypeError for sparse ones).
+        radius). The action is accept if lower >= `lower_bound`, otherwise reject if upper <= 1 -
+        `lower_bound`, otherwise verify. Raises NotFittedError before `fit`, and ValueError for
+        arrays that scikit-learn refuses (TypeError for sparse ones).
         """
         check_is_fitted(self)
         embeddings = torch.from_numpy(

@@ -96,11 +96,13 @@ class Decider(nn.Module):
         self.register_buffer("audit_salt", torch.tensor(audit_salt(conditions.seed)))
 
     def forward(self, x: Tensor, part: int = 0) -> Verdict:
-        """Decide on one trace.
+        """Decide whether the part of one trace is verified (by a slow check), accepted or rejected.
 
-        First come faults of the trace, then the operator's force limits, then the model, then the
-        audit draw. The model predicts only if the trace has no fault and is within the limits;
-        outside the limits it only embeds. What it raises is raised here.
+        First come faults of the trace (like a NaN), then the force limits (an operator's limits of
+        the signal), then the model, then the audit draw, by which some parts that the model would
+        accept or reject are verified all the same. The model predicts only if the trace has no
+        fault and is within the limits; outside the limits it only embeds, and the limit says
+        whether the part is verified or rejected. What the model raises is raised here.
 
         Parameters
         ----------
@@ -108,7 +110,8 @@ class Decider(nn.Module):
             The trace, contiguous.
         part : int, default 0
             Hash of the number of the part that the trace is of, 0 if unknown: then the content hash
-            stands for the part. References (labelled points) of this part do not count.
+            (of the samples) stands for the part. References (labelled points) of this part do not
+            count.
 
         Returns
         -------
@@ -119,8 +122,8 @@ class Decider(nn.Module):
             Content hash of the trace (`folds.content_hash`).
         action, predicted : int
             `ActionCode`s (0 verify, 1 accept, 2 reject): what to do, and what the model alone would
-            do. They differ in an audit, and if a force limit rejects. `predicted` is VERIFY if the
-            model did not predict.
+            do. They differ if the part is audited, and if a force limit rejects. `predicted` is
+            VERIFY if the model did not predict.
         reason : int
             Position in `Reason`: the fault of a faulty trace, OUTSIDE if a force limit decides,
             AUDIT if the part is audited, and otherwise the model's reason.
@@ -134,7 +137,7 @@ class Decider(nn.Module):
             faulty trace.
         propensity : float
             Probability, fixed beforehand, that this part is verified: the audit rate if the model
-            is certain, 0 if a force limit rejects, otherwise 1.
+            would accept or reject it, 0 if a force limit rejects, otherwise 1.
         """
         fault, content = self.check(x)
         if fault != 0:

@@ -191,7 +191,7 @@ INTERVALS: dict[str, Interval] = {
 
 
 def wilson_limits(xp: Any, n_success: Any, n_failure: Any, z: float) -> tuple[Any, Any]:
-    """Compute Wilson limits of float64 arrays (`xp` is numpy) or tensors (`xp` is torch).
+    """Compute Wilson intervals from counts, float64 arrays (`xp` is numpy) or tensors (torch).
 
     Parameters
     ----------
@@ -200,13 +200,13 @@ def wilson_limits(xp: Any, n_success: Any, n_failure: Any, z: float) -> tuple[An
     n_success, n_failure : float64 array or tensor, of one shape
         Counts of successes and of failures, 0 or more; not checked.
     z : float
-        Normal quantile, see `normal_quantile`.
+        Quantile of the normal distribution at 1 - alpha / 2 (`normal_quantile`).
 
     Returns
     -------
     lower, upper : float64 array or tensor of that shape
-        Cut to [0, 1], and moved to enclose the observed rate if rounding left it outside; (0, 1) if
-        nothing was counted.
+        Ends of the interval of each success probability, cut to [0, 1], and moved to enclose the
+        observed rate if rounding left it outside; (0, 1) if nothing was counted.
     """
     n = xp.where(n_success + n_failure > 0.0, n_success + n_failure, 1.0)
     centre = (n_success + z * z / 2.0) / (n + z * z)
@@ -215,7 +215,7 @@ def wilson_limits(xp: Any, n_success: Any, n_failure: Any, z: float) -> tuple[An
 
 
 def wald_limits(xp: Any, n_success: Any, n_failure: Any, z: float) -> tuple[Any, Any]:
-    """Compute Wald limits of float64 arrays (`xp` is numpy) or tensors (`xp` is torch).
+    """Compute Wald intervals from counts, float64 arrays (`xp` is numpy) or tensors (torch).
 
     Parameters
     ----------
@@ -224,13 +224,13 @@ def wald_limits(xp: Any, n_success: Any, n_failure: Any, z: float) -> tuple[Any,
     n_success, n_failure : float64 array or tensor, of one shape
         Counts of successes and of failures, 0 or more; not checked.
     z : float
-        Normal quantile, see `normal_quantile`.
+        Quantile of the normal distribution at 1 - alpha / 2 (`normal_quantile`).
 
     Returns
     -------
     lower, upper : float64 array or tensor of that shape
-        Cut to [0, 1], and moved to enclose the observed rate if rounding left it outside; (0, 1) if
-        nothing was counted.
+        Ends of the interval of each success probability, cut to [0, 1], and moved to enclose the
+        observed rate if rounding left it outside; (0, 1) if nothing was counted.
     """
     n = xp.where(n_success + n_failure > 0.0, n_success + n_failure, 1.0)
     half_width = z / xp.sqrt(n) * xp.sqrt(n_success * n_failure / (n * n))
@@ -301,9 +301,9 @@ def _beta_interval(
     For the lower end, `prior` is added to the successes and `other_prior` to the failures; for the
     upper end it is the other way round. `alpha` is the error level. The lower end is 0 without a
     success, the upper end 1 without a failure. An end that would leave out the observed rate, as
-    for an alpha near 1, is moved to it. The ends are arrays of the counts' shape, or floats
-    for scalar counts. Raises SettingError for an alpha out of range, ValueError for negative counts
-    and for counts of two shapes.
+    for an alpha near 1, is moved to it. The ends are arrays of the counts' shape, or floats for
+    scalar counts. Raises SettingError for an alpha out of range, ValueError for negative counts and
+    for counts of different shapes.
     """
     from scipy.special import betaincinv
 
@@ -319,7 +319,7 @@ def _beta_interval(
 
 
 def _as_counts(n_success: ArrayLike, n_failure: ArrayLike) -> tuple[FloatArray, FloatArray]:
-    """Return both counts as float64 arrays; ValueError for negative counts and for two shapes."""
+    """Return both counts as float64 arrays; ValueError if negative or of different shapes."""
     successes = np.asarray(n_success, dtype=np.float64)
     failures = np.asarray(n_failure, dtype=np.float64)
     if successes.shape != failures.shape:

@@ -76,8 +76,9 @@ class SafeMode(IntEnum):
 def max_recent_errors(tolerance: float) -> int:
     """Return how many of the newest `N_RECENT` (50) outcomes of a level may be wrong.
 
-    It is the smallest k for which more than k are wrong with a probability of at most
-    `TAIL_PROBABILITY` (0.2), if each outcome is wrong with the probability `tolerance`,
+    A level is a possible threshold of a score, and its outcomes are those of parts whose score
+    reached it. The number is the smallest k for which more than k are wrong with a probability of
+    at most `TAIL_PROBABILITY` (0.2), if each outcome is wrong with the probability `tolerance`,
     independently.
     """
     tail = 1.0
@@ -93,9 +94,10 @@ def log_capital_steps(tolerance: float, inclusion_probability: float) -> list[fl
 
     The bet is that the share of wrong parts (bad if accepted, good if rejected) is below
     `tolerance`, and its capital is the evidence for this: 1 / alpha or more refutes, at error level
-    alpha, that the share of wrong parts is above the tolerance. The stake is `BET` / (1 - `BET` *
-    tolerance), where `BET` is 0.55. A checked part's outcome was asked for with certainty, an
-    audited part's with the probability `inclusion_probability`; the stake on a checked part is
+    alpha, that the share of wrong parts is above the tolerance. Each part multiplies the capital by
+    1 + stake * (tolerance - w), where w is 1 for a wrong part and else 0. The stake is `BET` / (1 -
+    `BET` * tolerance), where `BET` is 0.55. A checked part's outcome was asked for with certainty,
+    an audited part's with the probability `inclusion_probability`; the stake on a checked part is
     multiplied by this probability.
 
     Returns
@@ -256,16 +258,16 @@ class MemberEvidence(nn.Module):
 
         It is called just before `update`, for the same part. A detector is a running sum of errors;
         when the sum reaches a limit, it raises an alarm, which starts the safe mode (nothing is
-        accepted or rejected). `n_unreported` is the number of accepted parts since the last label
-        whose outcome is unknown. Each lowers the sum of the detector of accepted parts like a part
-        that was good, and, outside of a safe mode, the sum of the detector of novel traces like a
-        trace that was not novel.
+        accepted or rejected). `n_unreported` is the number of accepted parts of unknown outcome
+        since the last label. Each lowers the sum of the detector of accepted parts like a part that
+        was good, and, outside of a safe mode, the sum of the detector of novel traces like a trace
+        that was not novel.
 
-        `novel` says whether the trace of this part was novel. Outside of a safe mode it steps the
-        detector of novel traces. In a safe mode that began because of novel traces, the sum of that
-        detector counts how long few traces have been novel, by which `update` ends the safe mode: a
-        sum below 0 is first taken as 0, then a trace that was not novel adds 1, a novel one takes
-        4. In any other safe mode `novel` has no effect.
+        `novel` says whether the trace of this part was novel (unlike all labelled traces). Outside
+        of a safe mode it steps the detector of novel traces. In a safe mode that began because of
+        novel traces, the sum of that detector counts how long few traces have been novel, by which
+        `update` ends the safe mode: a sum below 0 is first taken as 0, then a trace that was not
+        novel adds 1, a novel one takes 4. In any other safe mode `novel` has no effect.
         """
         self.step_detector(Detector.ACCEPTED_PARTS.value, self.correct_step, n_unreported)
         safe_mode = int(self.safe_mode.item())
@@ -291,17 +293,20 @@ class MemberEvidence(nn.Module):
         """Count the outcome of a part, choose thresholds anew, and end a safe mode if it is due.
 
         The outcome is offered to both sides, accepting and rejecting (`count_outcome`). The score
-        is `lower` for accepting, 1 - `upper` for rejecting. A side counts the outcome if the score
-        reaches one of the side's levels or `predicted` is the side's action, and its drift detector
-        takes a step if the score reaches the side's threshold. `lower` and `upper` are the bound on
-        the success probability that the part was decided by, `success` is its label, and
-        `predicted` (an `ActionCode`: 0 verify, 1 accept, 2 reject) is what the model alone would
-        have done. If the decision rule knows all outcomes (its own inclusion probability is 1),
-        every part counts as checked. Otherwise `inclusion_probability`, with which this outcome
-        would be asked for, says how it counts: 1 as checked, above 0 as audited, and at 0 only the
-        drift detectors see it. A wrong outcome may raise an alarm, which starts the safe mode: both
-        thresholds are then `CLOSED`, which no score reaches, so parts are verified until a side has
-        another threshold.
+        of the part is `lower` for accepting and 1 - `upper` for rejecting; `lower` and `upper` are
+        the bound on the success probability that the part was decided by. A side counts the outcome
+        if the score reaches one of its levels (possible thresholds), or if its action is
+        `predicted` (an `ActionCode`: 0 verify, 1 accept, 2 reject), which is what the model alone
+        would have done. The drift detector of a side (a running sum of its errors) takes a step if
+        the score reaches the side's present threshold. `success` is the label.
+
+        If the decision rule knows all outcomes (its own inclusion probability is 1), every part
+        counts as checked. Otherwise `inclusion_probability`, with which this outcome would be asked
+        for, says how it counts: 1 as checked, above 0 as audited (drawn at random), and at 0 only
+        the drift detectors see it. An outcome that is wrong for a side (a bad part for accepting, a
+        good one for rejecting) may raise an alarm, which starts the safe mode: both thresholds are
+        then `CLOSED`, which no score reaches, so parts are verified until a side has another
+        threshold.
 
         A safe mode ends only here. After an alarm about accepted or rejected parts it ends when
         that side has another threshold than `CLOSED`; the other side may have one earlier, and then
@@ -336,17 +341,18 @@ class MemberEvidence(nn.Module):
 
         Side 0 is accepting, and its `score` is the lower bound of the success probability; side 1
         is rejecting, and its score is 1 - upper bound. `wrong` says whether this action would have
-        been wrong for the part. If the score reaches the threshold of the side, the drift detector
-        of the side takes a step first, which may start the safe mode; all that follows then uses
-        the strictest level as target.
+        been wrong for the part. A side has levels (possible thresholds), one of which, the target,
+        is tested at a time. If the score reaches the threshold of the side, the side's drift
+        detector (a running sum of its errors) takes a step first, which may start the safe mode
+        (nothing is accepted or rejected); all that follows then uses the strictest level as target.
 
         If the decision rule knows all outcomes, the part counts as checked; otherwise
-        `inclusion_probability` says how: 1 as checked, above 0 as audited, and 0 not at all. Each
-        level (possible threshold) that the score reaches counts the part, and keeps whether it was
-        wrong among its newest 50. The part is a member (one of the parts that the claim is about)
-        if its score reaches the target level, or if `predicted`, the `ActionCode` of what the model
-        alone would have done, is the action of this side. No threshold is chosen if the part is
-        counted nowhere.
+        `inclusion_probability`, with which its outcome would be asked for, says how: 1 as checked,
+        above 0 as audited (drawn at random), and 0 not at all. Each level that the score reaches
+        counts the part, and keeps whether it was wrong among its newest 50. The part is a member
+        (one of the parts that the rule's promise is about) if its score reaches the target, or if
+        `predicted`, the `ActionCode` of what the model alone would have done, is the action of this
+        side. No threshold is chosen if the part is counted nowhere.
         """
         if score >= float(self.thresholds[side].item()):
             self.step_detector(side, self.error_steps[side] if wrong else self.correct_step, 1)
@@ -383,11 +389,11 @@ class MemberEvidence(nn.Module):
         the new sum may be one step below 0. If `times` is above 1, `step` must be negative: only
         the new sum is compared with the limit. Nothing happens if `times` is 0 or less.
 
-        An alarm starts the safe mode (both sides are closed), or starts it anew during one. It sets
-        the sums of all detectors and the counts since the last alarm to 0 (`start_safe_mode`).
-        During a safe mode the reason becomes the one of the old and the new that stands first in
-        `SafeMode`: a side that has not shown its tolerance yet stays the reason if an alarm of
-        novel traces follows.
+        An alarm starts the safe mode (nothing is accepted or rejected), or starts it anew during
+        one. It sets the sums of all detectors and the counts since the last alarm to 0
+        (`start_safe_mode`). During a safe mode the reason becomes the one of the old and the new
+        that stands first in `SafeMode`: too many errors in accepting or rejecting stay the reason
+        if an alarm of novel traces follows.
         """
         if times <= 0:
             return
@@ -405,8 +411,9 @@ class MemberEvidence(nn.Module):
 
         `safe_mode`, a `SafeMode` other than NONE, says which alarm began it. Both thresholds become
         `CLOSED`, which no score reaches. The sums of the drift detectors and the counts since the
-        last alarm restart at 0, and the target level of both sides is the strictest again. The
-        counts over all time, and the newest errors of each level, stay.
+        last alarm restart at 0, and the target level (the possible threshold that is tested) of
+        both sides, accepting and rejecting, is the strictest again. The counts over all time, and
+        the newest errors of each level, stay.
         """
         self.detector_sums.zero_()
         self.member_counts_since_alarm.zero_()
@@ -418,17 +425,19 @@ class MemberEvidence(nn.Module):
     def choose_threshold(self, side: int) -> None:
         """Set target level and threshold of one side (0 accepting, 1 rejecting) from the counts.
 
-        The target is the lowest level (possible threshold) whose parts since the last alarm give
-        enough evidence. The evidence is the log capital of a bet on the tolerance, of which log(1 /
-        alpha) is enough. Under the priced rule (guarantee `cost`) it is what was saved minus what
-        errors cost, in units of one error, of which -2 (-`OVERDRAFT`) is enough for accepting and 0
-        for rejecting. Under the pooled rule it is also required that few of the newest 50 parts of
-        the level were wrong (`max_recent_errors`). If no level meets this, the target is the
-        strictest level. The threshold is the score of the target if such a level was found, all
-        members (the parts that the promise is about) so far give enough evidence, and the members
-        since an alarm, if there was one, show recovery (`members_to_recovery` is 0 or less);
-        otherwise it is `CLOSED`, which no score reaches. Recovery is not asked for outside of a
-        safe mode if the side had no member before the alarm.
+        Each side has levels (possible thresholds), and the target is the level that it tests. It is
+        the lowest level whose parts since the last alarm give enough evidence. The evidence is the
+        log capital of a bet that the share of wrong parts is below the tolerance; log(1 / alpha) is
+        enough. Under the priced rule (guarantee `cost`) it is what was saved minus what errors
+        cost, in units of one error; -2 (-`OVERDRAFT`) is enough for accepting and 0 for rejecting.
+        Under the pooled rule it is also required that few of the newest 50 parts of the level were
+        wrong (`max_recent_errors`). If no level meets this, the target is the strictest level.
+
+        The threshold is the score of the target if such a level was found, all members (parts that
+        reached the target of their time) so far give enough evidence, and the members since an
+        alarm, if there was one, show recovery (`members_to_recovery` is 0 or less); otherwise it is
+        `CLOSED`, which no score reaches. Recovery is not asked for outside of a safe mode if the
+        side had no member before the alarm.
 
         The watched rule (the paper's rule with a safe mode) has no target. Only an alarm closes its
         threshold, which becomes the first level again once the members since the alarm show
@@ -468,13 +477,15 @@ class MemberEvidence(nn.Module):
     def members_to_recovery(self, side: int) -> float:
         """Return how many more members one side needs until it shows recovery from an alarm.
 
-        `side` is 0 for accepting, 1 for rejecting; members are the parts that the promise is about.
-        The number supposes that their outcomes go on as they were since the alarm. It is 0 or less
-        if they show recovery now, so that the side may open again. It is huge, of the order of
-        1e12, while their evidence is not enough and not above 0. The evidence is the log capital of
-        the bet; under the priced rule it is the balance of costs, and at least 25 members since the
-        alarm (`FEWEST_SINCE_ALARM`) are needed; under the watched rule it is the log likelihood
-        ratio of the tolerance to its double. Nothing is changed.
+        `side` is 0 for accepting, 1 for rejecting. Members are the parts whose score reached the
+        threshold that the side tested at the time. The number supposes that their outcomes go on as
+        they were since the alarm. It is 0 or less if they show recovery now, so that the side may
+        open again. It is huge, of the order of 1e12, while their evidence is not enough and not
+        above 0. The evidence is the log capital of a bet that the share of wrong members is below
+        the tolerance; under the priced rule it is what was saved minus what errors cost, and at
+        least 25 members since the alarm (`FEWEST_SINCE_ALARM`) are needed; under the watched rule
+        (the paper's, with a safe mode) it is the log likelihood ratio of the tolerance to its
+        double. Nothing is changed.
         """
         counts: list[int] = self.member_counts_since_alarm[side].flatten().tolist()
         n = counts[0] + counts[2]

@@ -79,15 +79,16 @@ class RadiusNeighbours(nn.Module):
         Parameters
         ----------
         z : Tensor of float32, shape (K, d)
-            The scaled embedding in each of the K embedding spaces.
+            The scaled embedding in each of the K embedding spaces. Space k holds the references
+            (labelled points) whose labels the encoder of the space was not trained on.
         part : int, default 0
-            Hash of the part that the trace is of. References (labelled points) of this part do not
-            count; 0 for an unknown part, which excludes none.
+            Hash of the part that the trace is of. References of this part do not count; 0 for an
+            unknown part, which excludes none.
 
         Returns
         -------
         action : int
-            0 verify, 1 accept, 2 reject.
+            0 verify, 1 accept, 2 reject, as the decision rule chooses.
         lower, upper : float
             Bound on the success probability, from the counts. If the module is `scored`, the first
             coordinate in each of the K spaces is a probability of success: both are the mean of

@@ -123,10 +123,10 @@ class NoveltyGate(nn.Module):
         Each score looks at one group of features, in this order: the level of the signals, their
         texture (how rough they are), distortions (what a faulty sensor or clock would do), and
         gaps. It is the squared distance to the nearest reference in these features, divided by the
-        limit of the group; references are traces that the gate was fitted to. A reference in a
-        small cluster of unusual traces counts as nearer than it is, so a score near it may be below
-        0. A score is NaN or infinite if a feature overflows; the trace is novel then, too. The
-        scores of a disabled gate mean nothing.
+        largest one that is still usual; references are traces that this module was fitted to. A
+        reference in a small cluster of unusual traces counts as nearer than it is, so a score near
+        it may be below 0. A score is NaN or infinite if a feature overflows; the trace is novel
+        then, too. If the module is `disabled`, the scores mean nothing.
         """
         plain = self.plain_features(x)
         features = torch.cat([plain, plain @ self.discriminants])
@@ -137,14 +137,15 @@ class NoveltyGate(nn.Module):
     def plain_features(self, x: Tensor) -> Tensor:
         """Return the features of traces (..., C, T) that are not distortions, (..., P) float32.
 
-        A channel is cut into S segments, stretches of equal length that together cover the trace,
-        and may overlap. For each channel the features are the S minima and the S maxima of the
-        segments, then 2*S + 3 logarithms of roughness, which is the norm of the differences of
-        successive samples in a stretch, plus `noise_floor`. The first S are of first differences in
-        the segments, the next S of second differences in the segments. The last three, for gaps,
-        are of first differences in brief stretches. Such a stretch has T / 100 differences, rounded
-        down, and at least one: the least roughness over stretches of twice that length, then the
-        least and the largest over stretches of that length.
+        P is C * (4*S + 3). A channel is cut into S segments, stretches of equal length that
+        together cover the trace, and may overlap. For each channel the features are the S minima
+        and the S maxima of the segments, then 2*S + 3 logarithms of roughness, which is the norm of
+        the differences of successive samples in a stretch, plus `noise_floor`. The first S are of
+        first differences in the segments, the next S of second differences in the segments. The
+        last three, for gaps, are of first differences in brief stretches. Such a stretch has T /
+        100 differences, rounded down, and at least one. These three are the least roughness over
+        stretches of twice that length, then the least and the largest over stretches of that
+        length.
         """
         pieces = x.unfold(-1, self.length, self.stride)  # (..., C, S, L)
         steps = x[..., 1:] - x[..., :-1]  # from sample to sample
@@ -175,7 +176,7 @@ class NoveltyGate(nn.Module):
 def fit_novelty(
     traces: NDArray[np.float32], margin: float, parts: NDArray[np.int64] | None = None
 ) -> NoveltyGate:
-    """Fit a novelty gate, by which traces like these are not novel; there is no randomness.
+    """Fit a novelty gate, the test whether a trace is unlike these (novel), without randomness.
 
     At most 500 (`REFERENCES`) of the traces, evenly spaced in time, become references, to which
     other traces are compared; of these, traces whose features overflow are left out. A reference is
@@ -276,11 +277,12 @@ def _noise_floor(gate: NoveltyGate, x: Tensor) -> Tensor:
 def _distort(x: Tensor) -> list[Tensor]:
     """Return distorted copies of traces x (n, C, T): a list of 14 tensors of that shape.
 
-    They are what a sensor or a clock would make of the traces, each in both directions: a gain of
-    0.6 and of 1.6, and one that falls or rises by 0.4 (4); an offset of 0.4, and a drift and a step
-    in the middle of 0.5, in units of the channel's standard deviation within a trace, the median
-    over the n traces (6); 8 % of speed and a delay of a 30th of the trace (4). Beyond its ends a
-    trace is mirrored.
+    They are what a faulty sensor or clock would make of the traces. Four have another gain: 0.6,
+    1.6, and a gain that begins at 1 and falls or rises by 0.4 in the course of the trace. Six are
+    moved up or down, in units of the channel's standard deviation within a trace (the median over
+    the n traces): by an offset of 0.4, by a drift that grows to 0.5, and by a step of 0.5 in the
+    middle. Four have another time: 8 % slower or faster, a 30th of the trace later or earlier.
+    Beyond its ends a trace is continued by its mirror image.
     """
     n_samples = x.size(2)
     t = torch.linspace(0.0, 1.0, n_samples)
@@ -306,9 +308,9 @@ def _discriminants(gate: NoveltyGate, x: Tensor, plain: Tensor, used: Tensor) ->
     features that are not standardised. `plain` (n, P), float64, are the traces' features by `gate`.
     Only features that `used` (P,), bool, marks are read; the rows of the others are 0. Of the
     traces fewer than 250, evenly spaced, are distorted, for the mean difference. The covariance is
-    that of all traces, plus the identity times (used features / n)**2, because the covariance of
-    few traces is not known, plus half of the covariance of the distorted traces. Inside,
-    standardised features are clipped at 6 deviations.
+    that of all traces, plus the identity times (number of used features / n)**2, because the
+    covariance of few traces is not known, plus half of the covariance of the distorted traces.
+    Inside, standardised features are clipped at 6 deviations.
     """
     offset, gain = (used * values for values in _standardise(plain))
     z = torch.addcmul(offset, plain, gain).clamp(-6.0, 6.0)
@@ -368,11 +370,15 @@ def _usual_distance_and_reach(points: Tensor, same: Tensor) -> tuple[float, Tens
 
     `points` (n, P) are features of n references; `same` (n, n), bool, marks pairs whose distance
     does not count. The usual distance is the 99.5 % quantile of squared distances to the nearest
-    other point, at most six times their 0.9 quantile, and at least 0.001. Outliers are farther than
-    that from all points, or than both 0.001 and three times the 0.9 quantile. The reach is the
-    usual distance. But if there are more than three outliers, the reach of an outlier is the
-    distance to its third nearest outlier, if this is larger, and if all points that are no outliers
-    are more than twice as far away.
+    other point, at most six times their 90 % quantile, and at least 0.001. The squared reach of a
+    point, within which another point is still near it, is the usual distance, except for some
+    outliers.
+
+    A point is an outlier if its squared distance to the nearest other point is above the usual one,
+    or above both 0.001 and three times the 90 % quantile. If there are more than three outliers,
+    the squared reach of an outlier is the squared distance to its third nearest outlier, if this is
+    larger than the usual one, and if all points that are no outliers are more than twice as far
+    away.
     """
     norms = points.square().sum(1)
     squared = torch.addmm(norms + norms[:, None], points, points.t(), alpha=-2.0)

@@ -170,8 +170,8 @@ class Policy:
     def _checked_limits(self) -> tuple[ForceLimits, ...]:
         """Return the force limits as a tuple of `ForceLimits`, parsing texts.
 
-        Raises SettingError if they are no tuple or list, or one of them is neither a text of limits
-        nor a `ForceLimits`.
+        They are an operator's limits of the signal. Raises SettingError if they are no tuple or
+        list, or one of them is neither a text of limits nor a `ForceLimits`.
         """
         given = self.force_limits if isinstance(self.force_limits, tuple | list) else (None,)
         limits: Any = tuple(
@@ -185,10 +185,10 @@ class Policy:
         return limits  # type: ignore[no-any-return]
 
     def _checked_prices(self) -> tuple[float, float, float]:
-        """Return the three prices as floats.
+        """Return the prices of a check, a bad accepted part and a good rejected part, as floats.
 
-        Raises SettingError if they are no tuple or list of three finite numbers above 0, or if
-        an error costs no more than two checks.
+        Raises SettingError if `prices` is no tuple or list of three finite numbers above 0, or if
+        one of the two errors costs no more than two checks.
         """
         given = self.prices if isinstance(self.prices, tuple | list) else ()
         prices = [float(price) for price in given if is_number(price)]
@@ -215,12 +215,12 @@ class Policy:
     def from_values(cls, values: Mapping[str, Any]) -> Self:
         """Return the policy whose settings `to_values` returned; missing ones have their defaults.
 
-        `values` holds the settings by name. The force limits are one text, separated by spaces, or
-        "none"; in older stores their name is "windows". Names that are no settings are ignored. A
-        missing guarantee (the rule that decides) is "local", and a missing audit rate (share of
-        certain decisions that are verified all the same) 0; with `prices` and no guarantee they are
-        "cost" and 0.05. Raises SettingError for a value out of its range, and for a guarantee that
-        needs audits without them.
+        `values` holds the settings by name. The force limits (an operator's limits of the signal)
+        are one text, separated by spaces, or "none"; in older stores their name is "windows". Names
+        that are no settings are ignored. A missing guarantee (the rule that decides) is "local",
+        and a missing audit rate (share of the parts to be accepted or rejected that are checked all
+        the same) is 0; with `prices` and no guarantee they are "cost" and 0.05. Raises SettingError
+        for a value out of its range, and for an audit rate of 0 with a guarantee that needs audits.
         """
         settings = {f.name: values[f.name] for f in fields(cls) if f.name in values}
         limits = values.get("force_limits", values.get(OLD_NAME, NO_LIMITS))
@@ -230,10 +230,12 @@ class Policy:
     def changed(self, **settings: Any) -> Self:
         """Return a copy with these settings changed.
 
-        If `prices` are among them, but no guarantee, and this policy has the guarantee "local" or
-        "pooled", which have no prices, then the guarantee becomes "cost", and an audit rate of 0
-        becomes 0.05, unless the settings have an audit rate. Raises SettingError for a value out of
-        its range, TypeError for a name that is no setting.
+        If `prices` are among them, but no guarantee (the rule that decides), and this policy has
+        the guarantee "local" or "pooled", which ignore prices, then the guarantee becomes "cost",
+        and an audit rate (share of the parts to be accepted or rejected that are checked all the
+        same) of 0 becomes 0.05, unless the settings have an audit rate. Raises SettingError for a
+        value out of its range, and for an audit rate of 0 with a guarantee that needs audits;
+        TypeError for a name that is no setting.
         """
         implied: Settings = {}
         has_prices_alone = settings.keys() & {"prices", "guarantee"} == {"prices"}
@@ -250,8 +252,9 @@ class Policy:
     def tolerances(self) -> tuple[float, float]:
         """Share of accepted parts that may be bad, and share of rejected parts that may be good.
 
-        Both are 1 - LB; under the guarantee "cost" they are check / escape and check / false
-        reject, the ratios of the `prices`.
+        Both are 1 - `lower_bound`. Under the guarantee "cost" they are ratios of `prices`: the
+        price of a check divided by that of a bad accepted part, and by that of a good rejected
+        part.
         """
         if self.guarantee != "cost":
             return 1.0 - self.lower_bound, 1.0 - self.lower_bound
@@ -281,12 +284,12 @@ class Policy:
         return 1.0 if self.stops == "all" else self.audit_rate or 1.0
 
     def rule(self) -> DecisionRule:
-        """Make a decision rule that has learned nothing yet.
+        """Make the decision rule, which turns bounds into actions; it has learned nothing yet.
 
-        `RULES` names its class for `guarantee` and `stops`; or it is the user's `module:Class`,
-        which is imported. The class gets alpha, lower_bound and interval. `PooledRule`,
-        `PricedRule` and their subclasses also get `inclusion_probability`, priced ones `tolerances`
-        as well.
+        Its class is the one that `RULES` names for `guarantee` and `stops`, or the user's own if
+        `guarantee` is `module:Class`, which is imported. The class gets alpha, lower_bound and
+        interval. `PooledRule`, `PricedRule` and their subclasses also get `inclusion_probability`
+        (the probability that an outcome is known), priced ones `tolerances` as well.
 
         Returns
         -------
@@ -326,8 +329,9 @@ class Policy:
     def certificate(self, outcomes: Outcomes) -> Certificate:
         """Return the bounds on how often parts decided without a check were decided wrongly.
 
-        With `stops="all"`, accepted parts of unknown outcome are left out. Raises the errors of
-        `certify`.
+        With `stops="all"` (every bad accepted part is reported), accepted parts of unknown outcome
+        are left out. Raises ValueError if `outcomes` counts more parts of a group as wrong than are
+        in it.
 
         Parameters
         ----------
@@ -337,8 +341,8 @@ class Policy:
         Returns
         -------
         Certificate
-            Two bounds, for accepted and for rejected parts, as `certify` returns it; with the
-            prices if the guarantee is "cost".
+            Two bounds, for accepted and for rejected parts, at confidence 1 - alpha each, as
+            `certify` returns them; with the prices if the guarantee is "cost".
         """
         if self.stops == "all":
             outcomes = replace(
@@ -367,7 +371,8 @@ class Policy:
         """Return the action that a bound (lower, upper) allows, whatever the guarantee is.
 
         It is the paper's rule: ACCEPT if lower >= `lower_bound`, otherwise REJECT if upper <= 1 -
-        `lower_bound`, otherwise VERIFY, also for NaN. Shadow mode and force limits have no effect.
+        `lower_bound`, otherwise VERIFY, also for NaN. Neither the shadow mode (every part is
+        verified) nor force limits have an effect here.
         """
         from .rule import action_of
 
@@ -377,7 +382,7 @@ class Policy:
 
 
 def check_radius(radius: float) -> None:
-    """Raise SettingError unless a radius is above 0 and at most `LARGEST_RADIUS`.
+    """Raise SettingError unless a radius is a number above 0, at most `LARGEST_RADIUS` (1e18).
 
     It is the distance, in units of the scaled embedding, within which labels count.
     """

@@ -188,7 +188,9 @@ class RadiusIndex(nn.Module):
         Returns
         -------
         array, shape (n,); for "points" (n, d)
-            Labels are a copy, int8, 1 for success; the other attributes are views of the index.
+            Labels are a copy, int8, 1 for success; the other attributes are views of the index: the
+            points, the number of each point's embedding space, the hash of its part, and the
+            sequence number of its label.
         """
         block = self.numbers if name == "numbers" else getattr(self, name).numpy()
         values: NDArray[Any] = block[..., : self.size()]
@@ -206,7 +208,8 @@ class RadiusIndex(nn.Module):
         """Add one point; in a full index it replaces the oldest.
 
         The sequence number of its label, in `numbers`, is not set; `add_one` sets it. All other
-        attributes of the index are updated, except `agreement`.
+        attributes of the index are updated, except `agreement` (how strongly the labels of one part
+        agree).
 
         Parameters
         ----------
@@ -276,8 +279,9 @@ class RadiusIndex(nn.Module):
         Returns
         -------
         n_success, n_failure : int
-            (0, 0) for an empty index. If any part in the index came more than once, these are the
-            votes of `count_votes`, rounded to whole numbers.
+            (0, 0) for an empty index. If any part in the index came more than once, the m points of
+            one part count as one to m votes, depending on how strongly labels of a part agree
+            (`count_votes`), and the sums are rounded to whole numbers.
         """
         n = distances.size(0)
         if n == 0:
@@ -293,10 +297,11 @@ class RadiusIndex(nn.Module):
     def count_votes(self, inside: Tensor) -> tuple[int, int]:
         """Count the points `inside`, (n,) bool; several points of one part may count as fewer.
 
-        m of them that are of one part are worth m / (1 + (m - 1) agreement) votes: one vote if the
-        labels of a part always agree, m votes if they are independent. A point of an unknown part
-        is one vote. Returns (successes, failures), each rounded to a whole number, because bounds
-        need whole trials.
+        m of them that are of one part are worth m / (1 + (m - 1) * `agreement`) votes; the
+        attribute, from 0 to 1, says how strongly labels of one part agree: one vote if the labels
+        of a part always agree, m votes if they are independent. A point of an unknown part is one
+        vote. Returns (successes, failures), each rounded to a whole number, because bounds need
+        whole trials.
         """
         slots = inside.nonzero().flatten()
         parts = self.parts.index_select(0, slots)
@@ -328,8 +333,9 @@ class RadiusIndex(nn.Module):
     ) -> None:
         """Add many points, the first row as the oldest; in a full index they replace the oldest.
 
-        `agreement` is not computed anew, see `estimate_agreement`. `total` grows by n, also if
-        fewer rows are added.
+        `agreement` (how strongly the labels of one part agree) is not computed anew, see
+        `estimate_agreement`. `total`, the number of points ever added, grows by n, also if fewer
+        rows are added.
 
         Parameters
         ----------
@@ -340,7 +346,7 @@ class RadiusIndex(nn.Module):
         spaces : array of int, shape (n,), optional
             Embedding space of each point; 0 if None.
         parts : array of int64, shape (n,), optional
-            Hashes; unknown parts if None.
+            Hash of each point's part; unknown parts (0) if None.
         numbers : array of int64, shape (n,), optional
             Sequence numbers of the labels; 0 if None.
 
@@ -414,9 +420,10 @@ class RadiusIndex(nn.Module):
         return True
 
     def estimate_agreement(self) -> None:
-        """Set `agreement` from the points in the index, for all counts from now on.
+        """Set `agreement`, how strongly labels of one part agree, for all counts from now on.
 
-        Nothing changes if no part came twice; see `label_agreement`.
+        It is computed from the points in the index (`label_agreement`). Nothing changes if no part
+        has several points in it.
         """
         if int(self.repeats) > 0:
             self.agreement.fill_(

@@ -78,11 +78,11 @@ class Candidate:
     def check(self) -> None:
         """Make the model ready to decide, and test it on some traces of its training.
 
-        The model takes over the rule of the previous model, which decides until now. If the
-        compiled model gives another result than the trained one, or raises, the training is
-        dropped: `model` becomes None, and the report says why. An exception while the rule is taken
-        over drops it, too. Exceptions are logged and not raised. If `model` is None already,
-        nothing is done.
+        The model takes over the decision rule (bound to action) of the previous model, which
+        decides until now. If the compiled model gives another result than the trained one, or
+        raises, the training is dropped (its model is never put in force): `model` becomes None, and
+        the report says why. An exception while the rule is taken over drops it, too. Exceptions are
+        logged and not raised. If `model` is None already, nothing is done.
         """
         if self.model is None:
             return
@@ -97,12 +97,12 @@ class Candidate:
             self.report = replace(self.report, reason=f"dropped: {defect}")
 
     def learn_next(self, window: TrainingWindow) -> bool:
-        """Make one of the labels that came after the training began a reference of the model.
+        """Make the oldest label since the training began that is not learned yet a reference.
 
-        `window` holds the newest labelled traces. Each call takes its oldest label that the model
-        did not get yet. It returns True if there was such a label; a label that the model cannot
-        take is logged and skipped. It returns False, and does nothing, if no label is left or
-        `model` is None.
+        A reference is a labelled point of the model, with which new traces are compared. `window`
+        holds the newest labelled traces. It returns True if there was such a label; a label that
+        the model cannot take is logged and skipped. It returns False, and does nothing, if no label
+        is left or `model` is None.
         """
         if self.model is None:
             return False
@@ -117,8 +117,8 @@ class Candidate:
         """Put the seconds of work so far into the report, and return it for the caller to store.
 
         If there is a model, the report is also marked as accepted and gets the number `version`.
-        Without a model it stays that of a dropped retrain, with the number of the version in force.
-        Seconds after this call are in no report.
+        Without a model it stays the report of a dropped retrain (whose version is not put in
+        force), with the number of the version in force. Seconds after this call are in no report.
         """
         # Storing it comes on top.
         self.report = replace(self.report, seconds=self._clock() - self._begin)

@@ -96,15 +96,23 @@ class Corrections:
     def correct(self, decision_id: str, success: bool, author: str = "") -> Changed:
         """Correct a wrong label, or let a forgotten one count again, from the next decision on.
 
-        References, the next retrain, the rule and the certificate take the label as corrected; the
-        fold of its trace stays. A baseline, which cannot take a label back, is retrained before
-        this returns; if it is pinned, it is fitted again as a new version. The label as it was
-        reported stays in the store. A training under way in the executor is discarded, and begins
-        again, even if nothing changes; one that is done is put in force or dropped. See the class
-        for what else every change does first, and for the check against the ledger. If a safe mode
-        begins or ends by this, an event is recorded, and `on_safe_mode`, the user's function, is
-        called. Without an executor the call also waits until the features for the next training are
-        computed, if that starts from another model because labels were forgotten.
+        The references (labelled points that new traces are compared with), the next retrain, the
+        decision rule and the certificate (bounds on the wrong decisions) take the label as
+        corrected. The trace keeps its fold (the group whose labels one of the cross-fitted encoders
+        never sees), and the label as it was reported stays in the store. A baseline (a model that
+        the user handed in), which cannot take a label back, is retrained before this returns; if it
+        is pinned (put in force by `rollback`, so that no retrain replaces it), it is fitted again
+        as a new version.
+
+        First the labels that wait are stored, and what other cells of the product (robot cells that
+        share labels and versions) stored is taken in. A training under way in the executor is
+        discarded, and begins again, even if nothing changes; one that is done is put in force or
+        dropped. If the label changes, the store is checked against its ledger (its hash chain);
+        after a difference every part is verified. If a safe mode (after an alarm, parts are
+        verified until new outcomes are good) begins or ends by the change, an event (a row in the
+        store's log) is recorded, and `on_safe_mode`, the user's function, is called. Without an
+        executor the call also waits until the features for the next training are computed, if that
+        starts from another model because labels were forgotten (withdrawn).
 
         Parameters
         ----------
@@ -125,7 +133,7 @@ class Corrections:
             For an unknown decision, for a decision without a label, and for a `success` that is no
             label.
         StoreError
-            If the store does not answer, the decision's trace is damaged, another robot cell of the
+            If the store does not answer, the decision's trace is damaged, another cell of the
             product stores a version meanwhile and a pinned baseline is to be fitted again, or the
             engine is closed, was opened for reading or before a fork. A change that was stored
             before the error stays stored.
@@ -156,19 +164,27 @@ class Corrections:
         """Leave labels out of all that is learned and counted, from the next decision on.
 
         `correct` brings a forgotten label back. Traces, and labels as they were reported, stay in
-        the store, and so do the versions that were trained with them. The version in force goes on
-        until the next retrain, which starts from weights that never saw these labels. If a rollback
-        pinned this version, and one of these labels is among those of its training or older than
-        all of them, it is released, so that retrains may replace it: it is stored as a new version,
-        before the labels are forgotten. A baseline is retrained before this returns; if it stays
-        pinned, it is fitted again as a new version. A training under way in the executor is
+        the store, and so do the versions that were trained with them. The version in force goes on,
+        without references (labelled points) from these labels, until the next retrain, which starts
+        from weights that never saw them. If a rollback pinned this version (so that no retrain
+        replaces it), and one of these labels is among those of its training or older than all of
+        them, it is released: it is stored as a new version, which retrains may replace, before the
+        labels are forgotten. A baseline (a model that the user handed in) is retrained before this
+        returns; if it stays pinned, it is fitted again as a new version.
+
+        First the labels that wait are stored, and what other cells of the product (robot cells that
+        share labels and versions) stored is taken in. A training under way in the executor is
         discarded, and begins again, even if nothing changes; one that is done is put in force or
-        dropped. See the class for what else every change does first, and for the check against the
-        ledger. If a safe mode begins or ends by this, an event is recorded, and `on_safe_mode`, the
-        user's function, is called. Without an executor the call also waits until the features for
-        the next training are computed, if that starts from another model now. A guarantee assumes
-        that the choice of what is forgotten does not depend on the label. The certificate counts a
-        forgotten outcome of a certain decision as wrong, so that forgetting earns nothing.
+        dropped. If labels change, the store is checked against its ledger (its hash chain); after a
+        difference every part is verified. If a safe mode (after an alarm, parts are verified until
+        new outcomes are good) begins or ends by the change, an event (a row in the store's log) is
+        recorded, and `on_safe_mode`, the user's function, is called. Without an executor the call
+        also waits until the features for the next training are computed, if that starts from
+        another model now.
+
+        A guarantee assumes that the choice of what is forgotten does not depend on the label. The
+        certificate (bounds on the wrong decisions) counts a forgotten outcome of a part that the
+        model would accept or reject as wrong, so that forgetting earns nothing.
 
         Parameters
         ----------
@@ -188,10 +204,10 @@ class Corrections:
             For an unknown decision, for a decision without a label, and if no id is given; then no
             label is forgotten.
         StoreError
-            If the store does not answer, the trace of a decision is damaged, another robot cell of
-            the product stores a version meanwhile and a pinned one is to be released or fitted
-            again, or the engine is closed, was opened for reading or before a fork. A change that
-            was stored before the error stays stored.
+            If the store does not answer, the trace of a decision is damaged, another cell of the
+            product stores a version meanwhile and a pinned one is to be released or fitted again,
+            or the engine is closed, was opened for reading or before a fork. A change that was
+            stored before the error stays stored.
         Exception
             What a baseline raises as it is copied for a retrain or, if it is pinned, fitted again;
             the change is stored then.
@@ -220,15 +236,16 @@ class Corrections:
         return self._change_labels(Change("forget", text, data, author, tuple(labels), None))
 
     def release(self, author: str = "") -> Changed:
-        """Let retrains replace again the version that `rollback` pinned.
+        """Let retrains replace again the version that `rollback` pinned (kept in force).
 
-        First a trained version is put in force or dropped, labels are stored, and what the
-        product's other robot cells stored is taken in, even if no version was pinned. The same
-        model goes on, stored as a new version. Labels that came meanwhile count for the next
-        retrain, which may be due at once. A training under way in the executor is discarded, and
-        begins again, even if no version was pinned. If a version was pinned, and a safe mode began
-        or ended meanwhile, an event is recorded, and `on_safe_mode`, the user's function, is
-        called.
+        First a trained version is put in force or dropped, labels are stored, and what other cells
+        of the product (robot cells that share labels and versions) stored is taken in; a training
+        under way in the executor is discarded, and begins again. This happens even if no version
+        was pinned. Then the same model goes on, stored as a new version. Labels that came while it
+        was pinned count for the next retrain, which may be due at once. If a version was pinned,
+        and a safe mode (after an alarm, parts are verified until new outcomes are good) began or
+        ended meanwhile, an event (a row in the store's log) is recorded, and `on_safe_mode`, the
+        user's function, is called.
 
         Parameters
         ----------
@@ -255,22 +272,28 @@ class Corrections:
     def rollback(self, version: int, author: str = "") -> Changed:
         """Put an earlier version in force again, as a new version with a new number, and pin it.
 
-        Its references include the labels that came since, up to the size of the training window,
-        with all corrections. The decision rule in force goes on. While the version is pinned, new
-        labels are stored and counted and become its references, but no automatic retrain replaces
-        it. It stays pinned until `release`, a retrain that somebody asks for, or `forget` of a
-        label that it was trained with or that is older than all of these; the next retrain then
-        starts from this version, unless it saw a forgotten label.
+        Its references (labelled points that new traces are compared with) include the labels that
+        came since, up to the size of the training window (the newest labelled traces), with all
+        corrections. The decision rule in force goes on. While the version is pinned, new labels are
+        stored and counted and become its references, but no automatic retrain replaces it. It stays
+        pinned until `release`, a retrain that somebody asks for, or `forget` of a label that it was
+        trained with or that is older than all of these; the next retrain then starts from this
+        version, unless it saw a forgotten label.
 
-        A training under way in the executor is discarded, even if nothing changes, and no other one
-        begins, unless this raises; a training that is done is put in force or dropped first. See
-        the class for what else every change does first, and for the check against the ledger. If a
-        safe mode began or ended meanwhile, an event is recorded, and `on_safe_mode`, the user's
+        First the labels that wait are stored, and what other cells of the product (robot cells that
+        share labels and versions) stored is taken in. A training under way in the executor is
+        discarded, even if nothing changes, and no other one begins, unless this raises; a training
+        that is done is put in force or dropped first. If something changes, the store is checked
+        against its ledger (its hash chain); after a difference every part is verified. If a safe
+        mode (after an alarm, parts are verified until new outcomes are good) began or ended
+        meanwhile, an event (a row in the store's log) is recorded, and `on_safe_mode`, the user's
         function, is called. Without an executor the call also waits until the features for the next
-        training are computed, if that starts from another model. A reducer like umap-learn, of
-        which not the fit but only the numbers of its traces are stored, is fitted again on the
-        traces of the earlier version, with the labels that they had then. A baseline is fitted on
-        the same traces, with the labels as they count now.
+        training are computed, if that starts from another model.
+
+        A reducer like umap-learn, of which not the fit but only the numbers of its traces are
+        stored, is fitted again on the traces of the earlier version, with the labels that they had
+        then. A baseline (a model that the user handed in) is fitted on the same traces, with the
+        labels as they count now.
 
         Parameters
         ----------
@@ -293,11 +316,11 @@ class Corrections:
         StoreError
             If the version is not kept (the message names those that are), if traces that it must be
             fitted on are damaged, if this dengine cannot restore it, if the store does not answer,
-            if another robot cell of the product stores a version meanwhile, or if the engine is
-            closed, was opened for reading or before a fork.
+            if another cell of the product stores a version meanwhile, or if the engine is closed,
+            was opened for reading or before a fork.
         Exception
-            What a model raises that must be fitted again; for the state of another reducer in rare
-            cases KeyError, ValueError or NotImplementedError.
+            What a model that must be fitted again raises; for the stored arrays of another reducer
+            in rare cases KeyError, ValueError or NotImplementedError.
         """
         expect(
             is_whole(version, -(2**63), 2**63 - 1),
@@ -320,29 +343,33 @@ class Corrections:
         """Decide by another policy from the next decision on.
 
         The policy is stored. A trained model goes on under it as a new version; before the first
-        training no version is made. Earlier decisions keep their bounds. The call waits for labels
-        that are on their way to the store. A training under way in the executor is discarded, and
-        begins again; one that is done is put in force or dropped first. What other robot cells of
-        the product have stored is taken in first, too.
+        training no version is made. Earlier decisions keep their bounds. First the labels that wait
+        are stored, and what other cells of the product (robot cells that share labels and versions)
+        stored is taken in. A training under way in the executor is discarded, and begins again; one
+        that is done is put in force or dropped.
 
         The decision rule turns bounds into actions, and may learn from outcomes. It starts anew if
         alpha, lower_bound, interval, guarantee, stops or prices change. Under the guarantees
-        "pooled" and "cost" with stops="some" it also starts anew if the audit rate changes. A new
-        rule is updated only with decisions from now on, because a tolerance that was chosen after
-        the data was seen cannot be tested on that data, and old bounds have another scale.
-        `certificate` counts decisions since the last change of the policy, whatever changed. If
-        somebody chooses the best of the certificates of m policies, the error probability of that
-        certificate is up to m alpha.
+        "pooled" and "cost" with stops="some" it also starts anew if the audit rate (the share of
+        certain decisions, accepts and rejects, that are checked all the same) changes. A new rule
+        is updated only with decisions from now on, because a tolerance that was chosen after the
+        data was seen cannot be tested on that data, and old bounds have another scale.
+        `certificate`, which bounds the share of wrong decisions, counts those since the last change
+        of the policy, whatever changed. If somebody chooses the best of the certificates of m
+        policies, the error probability of that certificate is up to m alpha.
 
-        A handed-in model keeps its rule, whatever changes.
+        A model that the user handed in keeps its own rule, whatever changes.
 
-        A safe mode goes on until new outcomes end it, but ends now if the new rule has none. If it
-        ends so, or if a safe mode began or ended meanwhile, an event is recorded, and
-        `on_safe_mode`, the user's function, is called. The next decision does not confirm a part
-        that was accepted before the change, also not with stops="all"; its outcome can still be
-        reported. With `Policy(shadow=True)` each part that the model is certain of is an audit:
-        `Decision.predicted` says what the model would have done, and all outcomes are learned from
-        as always. The shadow mode stays on when the engine is opened again.
+        A safe mode (after an alarm, parts are verified until new outcomes are good) goes on, but
+        ends now if the new rule has none. If it ends so, or if a safe mode began or ended
+        meanwhile, an event (a row in the store's log) is recorded, and `on_safe_mode`, the user's
+        function, is called. With stops="all" (every bad accepted part is reported before the next
+        decision) a decision confirms the accepted parts before it as good; but parts that were
+        accepted before the change are not confirmed, and their outcomes can still be reported. With
+        `Policy(shadow=True)`, the shadow mode, every part is verified, as an audit if the model
+        would accept or reject it: `Decision.predicted` says what the model would have done, and all
+        outcomes are learned from as always. The shadow mode stays on when the engine is opened
+        again.
 
         Parameters
         ----------
@@ -360,11 +387,11 @@ class Corrections:
         Raises
         ------
         SettingError
-            If `policy` is no Policy. If its force limits do not fit the traces, or are in seconds
-            while the rate of the traces is unknown. If the class of its guarantee cannot be
-            imported or made. If a model was handed in, and a setting changes other than audit_rate,
-            stops, label_within, force_limits and shadow. If the recipe of another cell of the
-            product cannot be read.
+            If `policy` is no Policy. If its force limits (an operator's limits of the signal) do
+            not fit the traces, or are in seconds while the rate of the traces is unknown. If the
+            class of its guarantee cannot be imported or made. If a model was handed in, and a
+            setting changes other than audit_rate, stops, label_within, force_limits and shadow. If
+            the recipe (the stored settings) of another cell of the product cannot be read.
         StoreError
             If the store does not answer, another cell of the product stores a version meanwhile, or
             the engine is closed, was opened for reading or before a fork.
@@ -435,9 +462,11 @@ class Corrections:
     def _find_labelled(self, decision_ids: Sequence[Any]) -> list[StoredDecision]:
         """Finish what is under way (`_bring_up_to_date`), then return the decisions with these ids.
 
-        They are in the order of the ids. `success` of a decision is None if its label was
-        forgotten. Raises ReportError for an unknown id, and for a decision that never had a label,
-        and StoreError if the store does not answer or a trace is damaged.
+        A trained version is put in force or dropped, and a training that is not done is discarded
+        and begins again later; labels that wait are stored, and what other robot cells stored is
+        taken in. The decisions are in the order of the ids. `success` of a decision is None if its
+        label was forgotten (withdrawn). Raises ReportError for an unknown id, and for a decision
+        that never had a label, and StoreError if the store does not answer or a trace is damaged.
         """
         self._bring_up_to_date()
         decisions = []
@@ -451,17 +480,22 @@ class Corrections:
         return decisions
 
     def _change_labels(self, change: Change) -> Changed:
-        """Store a change of labels, apply it to references, window and rule; return what was done.
+        """Store a change of labels, and apply it to all that was learned; return what was done.
 
-        The outbox drops the changed decisions from its memory, and will read them from the store. A
-        model that cannot change its references is retrained, in this thread, or, if it is pinned,
-        fitted again as a new version. The store is checked against its ledger; a difference sets
-        the outbox's `integrity_error`. If a safe mode begins or ends by this, an event is recorded,
-        and `on_safe_mode`, the user's function, is called. Raises StoreError if the store does not
-        answer, or if another robot cell of the product stores a version while a pinned model is
-        fitted again, and what a model raises as it is copied for a retrain or, if it is pinned,
-        fitted again; a change that is stored by then is applied with the next one, or when the
-        store is opened again.
+        It is applied to the references (labelled points that new traces are compared with), the
+        training window (the newest labelled traces) and the decision rule. The outbox, which
+        records decisions, drops the changed ones from its memory, and will read them from the
+        store. A model that cannot change its references is retrained, in this thread, or, if it is
+        pinned (kept in force by a rollback), fitted again as a new version. The store is checked
+        against its ledger (its hash chain); a difference sets the outbox's `integrity_error`, after
+        which every part is verified. If a safe mode (after an alarm, parts are verified until new
+        outcomes are good) begins or ends by this, an event (a row in the store's log) is recorded,
+        and `on_safe_mode`, the user's function, is called.
+
+        Raises StoreError if the store does not answer, or if another robot cell that shares the
+        model stores a version while a pinned model is fitted again, and what a model raises as it
+        is copied for a retrain or, if it is pinned, fitted again; a change that is stored by then
+        is applied with the next one, or when the store is opened again.
         """
         number = self._store.corrections.apply(change)
         for id_ in change.decisions:
@@ -477,10 +511,12 @@ class Corrections:
     ) -> Changed:
         """Return what a stored change did; also announce a safe mode that it began or ended.
 
-        `number` is that of the change's event; None means that it is the store's newest event. The
-        announcement is an event and a call of `on_safe_mode`, the user's function; if it fails,
-        that is logged. `reason_ended` is the reason that is recorded if a safe mode ended. Raises
-        StoreError if the store must be asked for the number and does not answer.
+        A safe mode is a time after an alarm in which parts are verified until new outcomes are
+        good. `number` is that of the change's event, its row in the store's log; None means that it
+        is the newest event there. The announcement is another event and a call of `on_safe_mode`,
+        the user's function; if it fails, that is logged. `reason_ended` is the reason that is
+        recorded if a safe mode ended. Raises StoreError if the store must be asked for the number
+        and does not answer.
         """
         if number is None:
             number = self._store.events.newest(1)[0].number

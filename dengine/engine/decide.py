@@ -67,14 +67,16 @@ class DecisionMaker:
         """Set the `TraceSpec` (shape, rate and unit of all traces); return the one in force.
 
         If a `TraceSpec` is in force already, it stays. It only gets from `spec` a rate, units and
-        columns that were unknown; a `spec` of another shape is ignored. If none is in force and
-        another robot cell of the product has set one, its `TraceSpec` is taken in the same way; if
-        it cannot be read, that is logged and `spec` is set.
+        columns (names of channels) that were unknown; a `spec` of another shape is ignored. If none
+        is in force and another cell of the product (robot cells that share labels and versions) has
+        set one, its `TraceSpec` is taken in the same way; if it cannot be read, that is logged and
+        `spec` is set.
 
         A change is saved in the store; if the store does not take it, it is saved with a later
-        trace; this is logged. Raises SettingError if the force limits do not fit the `TraceSpec`;
-        then nothing changes. Saving raises it, too, if another cell of the product has settings
-        that contradict these; the new `TraceSpec` then stays in force here and is not saved.
+        trace; this is logged. Raises SettingError if the force limits (an operator's limits of the
+        signal) do not fit the `TraceSpec`; then nothing changes. Saving raises it, too, if another
+        cell of the product has settings that contradict these; the new `TraceSpec` then stays in
+        force here and is not saved.
         """
         store = self._outbox.store
         present = self._settings.now
@@ -93,17 +95,18 @@ class DecisionMaker:
     def convert(self, trace: ArrayLike) -> TraceArray:
         """Return a trace as float32 (channels, samples), in the shape of the `TraceSpec`.
 
-        A trace of another length is fitted if the `TraceSpec` says how. If no `TraceSpec` is in
-        force, a trace without a fault sets it; but if another robot cell of the product has set
-        one, that one is taken, and the trace must fit it. If a `TraceSpec` is in force, but the
-        store did not take the settings, saving them is tried again; a failure is logged. Until the
-        first version is trained, the first finite trace makes the untrained model compile its code
-        for this shape; a failure of this is logged, too.
+        The `TraceSpec` in force is the shape, rate and unit of all traces. A trace of another
+        length is fitted if it says how. If none is in force, a trace without a fault (such as NaN,
+        or samples that are all equal) sets it; but if another cell of the product (robot cells that
+        share labels and versions) has set one, that one is taken, and the trace must fit it. If a
+        `TraceSpec` is in force, but the store did not take the settings, saving them is tried
+        again; a failure is logged. Until the first version is trained, the first finite trace makes
+        the untrained model compile its code for this shape; a failure of this is logged, too.
 
-        A trace with NaN, or another fault, is returned like any other, but sets no `TraceSpec`. The
-        array that is returned may share its memory with `trace`. Raises TraceError for a wrong
-        shape, for values that are no real numbers, or too few samples of a first trace, and
-        SettingError for the reasons of `set_trace_spec`.
+        A trace with a fault is returned like any other, but sets no `TraceSpec`. The array that is
+        returned may share its memory with `trace`. Raises TraceError for a wrong shape, for values
+        that are no real numbers, or too few samples of a first trace, and SettingError for the
+        reasons of `set_trace_spec`.
         """
         settings = self._settings.now
         x = as_trace(trace, settings.trace)
@@ -124,9 +127,9 @@ class DecisionMaker:
         """Return the decision that the store already has for an id, or None for a new id.
 
         The id comes from the caller, and `part` is the part's number, which is not compared with
-        that of a stored decision. If the id cannot be looked up, this is logged, and the decision
-        returned is a VERIFY for this `part` with `Reason.NO_STORE`. It is not recorded, because the
-        id may have a decision already; `trace` is not looked at. A report for this id then raises
+        that of a stored decision. If the id cannot be looked up, this is logged, and a new VERIFY
+        for this `part` with `Reason.NO_STORE` is returned. It is not recorded, because the id may
+        have a decision already; `trace` is not looked at. A report for this id then raises
         StoreError, until a later call can look the id up.
 
         Raises
@@ -134,8 +137,8 @@ class DecisionMaker:
         TraceConflictError
             If the stored decision was made on another trace.
         TraceError
-            If the id has a decision, and `trace` does not fit the `TraceSpec` in force or holds
-            values that are no real numbers.
+            If the id has a decision, and `trace` does not have the shape of the `TraceSpec` in
+            force or holds values that are no real numbers.
         """
         try:
             earlier = self._outbox.find_earlier(decision_id)
@@ -157,7 +160,7 @@ class DecisionMaker:
         decision_id: str | None = None,
         verify_reason: Reason | None = None,
     ) -> StoredDecision:
-        """Decide on one trace and hand the decision to the outbox, without waiting for the disk.
+        """Decide on one trace and record the decision, without waiting for the disk.
 
         Any thread may call it, unless the store is in memory.
 
@@ -171,10 +174,11 @@ class DecisionMaker:
             An id that the caller chose, and that has no decision yet (`find_earlier`); None: a new
             one.
         verify_reason : Reason, optional
-            Verify for this reason, without asking the model and without checking the force limits.
-            If the store is damaged or its journal cannot be written, `Reason.NO_STORE` takes its
-            place, also if None is passed. A fault of the trace (`TraceGate`) takes the place of
-            both.
+            Verify for this reason, without asking the model and without checking the force limits
+            (an operator's limits of the signal). If the store is damaged, or its journal (the file
+            on the local disk that gets each record first) cannot be written, `Reason.NO_STORE`
+            takes its place, also if None is passed. A fault of the trace, like a NaN, takes the
+            place of both.
 
         Returns
         -------
@@ -196,8 +200,9 @@ class DecisionMaker:
 
         If that takes longer than the store's time limit, or a write fails, nothing is raised: an
         ACCEPT or REJECT is replaced by a VERIFY with `Reason.NO_STORE`, which is returned, and
-        which is not on disk yet. But if the first decision has reached the disk meanwhile, it stays
-        valid and is returned. A VERIFY is returned as it is, even if it is not on disk.
+        which is not on disk yet. But if the first decision (`stored`) has reached the disk
+        meanwhile, it stays valid and is returned. A VERIFY is returned as it is, even if it is not
+        on disk.
         """
         decision = stored.decision
         try:
@@ -212,15 +217,16 @@ class DecisionMaker:
         return stored
 
     def record_timeout(self, trace: ArrayLike, part: Any, decision_id: Any) -> Decision:
-        """Record VERIFY, `Reason.LATE`, while another thread may use the engine, and return it.
+        """Record that the caller waits no more: return a VERIFY with `Reason.LATE`.
 
-        Any thread may call it. It returns once the decision is on disk, when a write fails, or when
-        the store's time limit is over; the last two are not raised. A fault of the trace or the
-        store is the reason instead of LATE. If the id has a decision already, that decision is
-        returned. If the id cannot be looked up, the result is a VERIFY with `Reason.NO_STORE` that
-        is not recorded. With a store in memory, or while no `TraceSpec` is in force, the VERIFY is
-        not recorded either, and the trace of a new id is not looked at: only the thread that uses
-        the engine may do that.
+        Any thread may call it, also while another thread uses the engine. It returns once the
+        decision is on disk, when a write fails, or when the store's time limit is over; the last
+        two are not raised. A fault of the trace or the store is the reason instead of LATE. If the
+        id has a decision already, that decision is returned, whatever it is. If the id cannot be
+        looked up, the result is a VERIFY with `Reason.NO_STORE` that is not recorded. With a store
+        in memory, or while no `TraceSpec` (shape of all traces) is in force, the VERIFY is not
+        recorded either, and the trace of a new id is not looked at: only the thread that uses the
+        engine may do that.
 
         Raises TraceError for an invalid part number, an id that belongs to another trace, and a
         trace that does not fit the `TraceSpec` in force or holds values that are no real numbers,
@@ -249,18 +255,19 @@ class DecisionMaker:
     ) -> StoredDecision:
         """Decide on one trace by a model; return the decision as a record that is not stored yet.
 
-        A trace with a fault (`TraceGate`) is verified for that reason, and its record is
+        A trace with a fault, like a NaN, is verified for that reason, and its record is
         quarantined: it is never trained on. Otherwise, with a `verify_reason` the decision is
-        VERIFY for this reason, and the force limits are not checked. Without it a trace outside a
-        force limit is verified or rejected, also without a model, and if the model raises. Else,
-        without a model the decision is VERIFY, `Reason.NO_MODEL`. If the model raises, or returns
-        bounds that are not 0 <= lower <= upper <= 1, that is logged, and the decision is VERIFY,
-        `Reason.MODEL_ERROR`. Without a `decision_id` it gets a new id.
+        VERIFY for this reason, and the force limits (an operator's limits of the signal) are not
+        checked. Without it a trace outside a force limit is verified or rejected, as the limit
+        says, also without a model, and if the model raises. Else, without a model the decision is
+        VERIFY, `Reason.NO_MODEL`. If the model raises, or returns bounds that are not 0 <= lower <=
+        upper <= 1, that is logged, and the decision is VERIFY, `Reason.MODEL_ERROR`. Without a
+        `decision_id` it gets a new id.
 
-        The decision is marked as an audit if the model was certain and the part is verified all the
-        same. Its version is the one in force, also if no model was asked. The record has a copy of
-        the trace, the time by the store's clock, and the hash of the part's number; for an unknown
-        part that is the content hash of the trace.
+        The decision is marked as an audit if the model would accept or reject the part and it is
+        verified all the same. Its version is the one in force, also if no model was asked. The
+        record has a copy of the trace, the time by the store's clock, and the hash of the part's
+        number; for an unknown part that is a hash of the samples.
         """
         part_hash_ = 0 if part is None else part_hash(part)
         # Without a TraceSpec the trace has a fault, and is decided all the same.
@@ -341,7 +348,8 @@ def verify_decision(decision_id: str, part: str | None, version: int, reason: Re
 
     `part` is the part's number, and `version` that of the model. It counts no labels, and has the
     bounds 0 and 1, no embedding, and 1 as its `propensity`, the probability of a check. What the
-    model would have done, `predicted`, is VERIFY, too, so it is no audit. Nothing is recorded.
+    model would have done, `predicted`, is VERIFY, too; so it is no audit (a check of a part that
+    the model would accept or reject). Nothing is recorded.
     """
     return Decision(
         id=decision_id,
@@ -366,8 +374,8 @@ def as_part(part: Any) -> str | None:
     Raises
     ------
     TraceError
-        For anything but None, an integer, Python's or NumPy's, of at most LONGEST characters (200,
-        with its sign), or a text of 1 to LONGEST printable characters. True, False and floats such
+        For anything but None, an integer (Python's or NumPy's) of at most LONGEST characters (200,
+        with its sign), and a text of 1 to LONGEST printable characters. True, False and floats such
         as 7.0 are refused.
     """
     if part is None:

@@ -95,8 +95,8 @@ class RunOptions(TypedDict, total=False):
 def _close_forgotten(outbox: Outbox) -> None:
     """Close the outbox of an engine that a program did not close; a StoreError is logged.
 
-    This writes the records that were left. It is called when the engine is garbage-collected or the
-    program ends.
+    The outbox records decisions and labels; what it did not write to the store yet is written. This
+    is called when the engine is garbage-collected or the program ends.
     """
     try:
         outbox.close()
@@ -217,13 +217,15 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         """Make the objects of which the engine consists, on an opened store, and connect them.
 
         `template` is the untrained model, and the arguments from `executor` to `on_safe_mode` are
-        those of `DataEngine`. Afterwards `_close_forgotten` closes the outbox, and with it a store
-        that is not in memory, when the engine is garbage-collected or the program ends. The outbox
-        claims the robot cell, writes what an earlier process left in the journal to the store, and
-        checks the store (`open_outbox`); version and labels are not restored yet (`_resume`).
-        Without an executor, and unless the engine only reads (`reading`), the modules that a
-        retrain imports are loaded; what that raises, for a reducer of the user's, is raised. Limits
-        this thread to one torch thread. Raises SettingError for force limits in seconds at an
+        those of `DataEngine`. One of the objects is the outbox, which records decisions and labels
+        on the local disk (in a journal) and then in the store. It claims the robot cell, so that no
+        other engine may run on it, writes what an earlier process left in the journal to the store,
+        and checks the store (`open_outbox`); version and labels are not restored yet (`_resume`).
+        When the engine is garbage-collected or the program ends, `_close_forgotten` closes the
+        outbox, and with it a store that is not in memory. Without an executor, and unless the
+        engine only reads (`reading`), the modules that a retrain imports are loaded; what that
+        raises, for a reducer of the user's, is raised. Limits this thread to one torch thread.
+        Raises SettingError for force limits (an operator's limits of the signal) in seconds at an
         unknown rate, and StoreError if another engine owns the cell or the store cannot be used.
         """
         recipe = settings.recipe
@@ -263,15 +265,15 @@ class DataEngine(AbstractContextManager["DataEngine"]):
 
         The engine then decides bit for bit as before it was closed, with two exceptions: if the
         newest version is damaged, the newest intact one decides, and if the store differs from its
-        ledger, every part is verified. A damaged version or trace is reported by an event in the
-        store. A new robot cell of a product decides by the product's newest version. A model of
-        which the store has only the numbers of its traces is trained on them again; if one of these
-        is damaged or missing, no model is in force. A thread may be started that computes in
-        advance for the next retrain. This method is called once, before the first decision, and
-        waits for the store without a time limit. If retrains run in the calling thread, it also
-        waits until the first retrain can begin without delay. Raises the errors of
-        `LiveModel.resume` and `Feedback.resume`; StoreError if the store cannot be read is one of
-        them.
+        ledger (its hash chain), every part is verified. A damaged version or trace is reported by
+        an event (a row in the store's log). A new cell of a product (robot cells that share labels
+        and versions) decides by the product's newest version. A model of which the store has only
+        the numbers of its traces is trained on them again; if one of these is damaged or missing,
+        no model is in force. A thread may be started that computes in advance for the next retrain.
+        This method is called once, before the first decision, and waits for the store without a
+        time limit. If retrains run in the calling thread, it also waits until the first retrain can
+        begin without delay. Raises the errors of `LiveModel.resume` and `Feedback.resume`;
+        StoreError if the store cannot be read is one of them.
         """
         settings = self._settings.now
         self._learner.resume(settings.recipe.policy.label_within, settings.policy_since)
@@ -282,12 +284,13 @@ class DataEngine(AbstractContextManager["DataEngine"]):
     def _wait_until_warm(self) -> None:
         """Wait until the first retrain can begin without delay.
 
-        When it returns, the modules that a retrain imports are loaded, and what `Learner.resume`
-        began to compute is computed. If there are new labels and no version yet, this call also
-        computes the features of their traces, and compiles the code for decisions if the model can
-        be compiled. With a version in force it computes nothing: the next training itself computes
-        the features of traces that came since. There is no time limit; if loading or computing
-        fails, that is logged, and nothing is raised.
+        When it returns, the modules that a retrain imports are loaded, and the thread that computes
+        in advance for the next training (`Learner.resume` may have started it) is done. If there
+        are new labels and no version yet, the features of their traces are among what is computed,
+        and the code for decisions is compiled if the model can be compiled. If a version is in
+        force, nothing more is computed here: the next training itself computes the features of
+        traces that came since. There is no time limit; if loading or computing fails, that is
+        logged, and nothing is raised.
         """
         guarded(NOT_PRECOMPUTED, self._live.template.warm_up)
         if self.state.new_labels and not self.version:
@@ -298,8 +301,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
     def _closed_on_failure(self) -> Iterator[None]:
         """Close the outbox and raise the error again if the block raises; else leave it open.
 
-        This also closes the store, unless it is in memory. If closing raises StoreError, that is
-        raised instead.
+        The outbox records the decisions and labels of the engine; closing it also closes the store,
+        unless that is in memory. If closing raises StoreError, that is raised instead.
         """
         try:
             yield
@@ -322,14 +325,15 @@ class DataEngine(AbstractContextManager["DataEngine"]):
     ) -> Self:
         """Open a store that had an engine; go on with its version and decisions, bit for bit.
 
-        The engine owns the robot cell until `close`, unless it only reads, and limits this thread
-        to one torch thread. Records that an earlier process left in the journal are written to the
-        store; an engine that only reads leaves them there and does not know them. Rows that are not
-        as they were written are not raised: every part is verified then
+        The engine owns the robot cell until `close`, unless it only reads: no other engine may run
+        on the cell. It limits this thread to one torch thread. Records that an earlier process left
+        in the journal (the file on the local disk that gets each record first) are written to the
+        store; an engine that only reads leaves them there and does not know them. If rows of the
+        store are not as they were written, nothing is raised, but every part is verified
         (`EngineState.integrity_error`). If the newest version is damaged, the newest intact one
-        decides, and an event in the store says so, also with `reading`. Without an executor, unless
-        it only reads, the call also waits until a retrain can begin at once. If it raises, a store
-        that it opened is closed; an `SqlStore` that was passed may be closed, too.
+        decides, and an event (a row in the store's log) says so, also with `reading`. Without an
+        executor, unless it only reads, the call also waits until a retrain can begin at once. If it
+        raises, a store that it opened is closed; an `SqlStore` that was passed may be closed, too.
 
         Parameters
         ----------
@@ -339,8 +343,9 @@ class DataEngine(AbstractContextManager["DataEngine"]):
             If the engine had an object of yours that the store cannot name: the same object again.
             A reducer's name is accepted, but not compared with the store's.
         trace : TraceSpec, optional
-            The `TraceSpec` as the store has it, together with a rate, units or columns that were
-            unknown so far; they are stored, unless `reading`. If the store has none yet, any.
+            The `TraceSpec` (shape, rate and unit of all traces) as the store has it, perhaps with a
+            rate, units or columns that were unknown so far; they are stored, unless `reading`. If
+            the store has none yet, any may be given.
         wait : float, optional
             Seconds that a call waits for the database, like `wait` of `SqlStore`; not used for an
             open store.
@@ -371,8 +376,9 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         SettingError
             If an object of yours is missing or is another one than the engine had, if a `model` is
             given to an engine that has its own, if `trace` contradicts the stored `TraceSpec` or
-            that of another cell of the product, if the stored recipe cannot be read, or if its
-            force limits do not fit the traces.
+            that of another cell of the product (robot cells that share labels and versions), if the
+            stored recipe (the settings) cannot be read, or if its force limits (an operator's
+            limits of the signal) do not fit the traces.
         ImportRefusedError
             A SettingError, if a class would have to be imported that is not allowed.
         """
@@ -411,7 +417,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         store : str, path, SqlStore or None
             None: a new one in memory.
         seed : int, optional
-            None: the seed of the used store or of a peer, or 0.
+            None: the seed of the used store or, in a new cell of a product (robot cells that share
+            labels and versions), of the first other cell; else 0.
         wait : float, optional
             Seconds that a call waits for the database; not used for an open store.
         allow_import : bool
@@ -419,14 +426,15 @@ class DataEngine(AbstractContextManager["DataEngine"]):
             name is imported in any case.
         **settings
             As `DataEngine` takes them. For a used store, the given settings must be the settings in
-            force, so that a running robot cell does not change unnoticed. Of a recipe or policy all
-            fields are compared, also those at their defaults. The shadow mode, missing force limits
-            and arguments that are left out are not compared (`EngineSettings.check_request`). A
-            reducer that is an object, `model` and `trace` are as for `open`; `executor`, `clock`,
-            `replaying` and `on_safe_mode` are not stored, so any may be given. A new cell of a
-            product (cells that share labels and versions) takes the seed, if none is given, from
-            the first of its peers, the other cells. It takes the recipe, too, unless it is given a
-            recipe, reducer or model, or the peer was given an object as reducer or model.
+            force, so that a running robot cell does not change unnoticed. Of a recipe (all settings
+            in one object) or policy all fields are compared, also those at their defaults. The
+            shadow mode (every part is verified), missing force limits (an operator's limits of the
+            signal) and arguments that are left out are not compared
+            (`EngineSettings.check_request`). A reducer that is an object, `model` and `trace` are
+            as for `open`; `executor`, `clock`, `replaying` and `on_safe_mode` are not stored, so
+            any may be given. A new cell of a product also takes the recipe of the first other cell,
+            unless it is given a recipe, reducer or model, or the other cell was given an object as
+            reducer or model.
 
         Returns
         -------
@@ -436,10 +444,10 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         Raises
         ------
         SettingError
-            If a given setting differs from the used store's, contradicts that of a peer, is
-            unknown, or is out of range, if an object of yours is missing or is another one than the
-            engine had, and if a stored recipe cannot be read. A store that was opened here is then
-            closed; an `SqlStore` that was passed may be, too.
+            If a given setting differs from the used store's, contradicts that of another cell of
+            the product, is unknown, or is out of range, if an object of yours is missing or is
+            another one than the engine had, and if a stored recipe cannot be read. A store that was
+            opened here is then closed; an `SqlStore` that was passed may be, too.
         StoreError
             If another engine owns the cell, the store cannot be used, or this dengine cannot
             restore its newest version (in rare cases KeyError, ValueError or NotImplementedError).
@@ -468,15 +476,16 @@ class DataEngine(AbstractContextManager["DataEngine"]):
     def close(self) -> None:
         """Finish a retrain under way, within seconds, write everything, and close the store.
 
-        A training that is not done 5 s after this call is dropped. In a product the news of the
-        other robot cells is taken in before; if it has a correction or a rollback, or the store
-        does not answer, a retrain that is not in force yet is lost. A second call does nothing, nor
-        does one in a forked process. Records that only the database does not take stay in the
-        journal. Records that the disk does not take are given up, and an error is logged; no call
-        has said that they are on disk. If the disk hangs, the store stays open, and no other engine
-        can own the cell until the process ends. With `replaying=True` this waits for the disk and
-        the database without a time limit. A store in memory stays open. Raises StoreError while
-        another thread uses the engine.
+        A training that is not done 5 s after this call is dropped. In a product (robot cells that
+        share labels and versions) the call first takes in what the other cells stored; if that has
+        a changed label or a rollback, or the store does not answer, a retrain that is not in force
+        yet is lost. A second call does nothing, nor does one in a forked process. Records that only
+        the database does not take stay in the journal, a file on the local disk, and the next
+        engine writes them. Records that the disk does not take are given up, and an error is
+        logged; no call has said that they are on disk. If the disk hangs, the store stays open, and
+        no other engine can own the cell until the process ends. With `replaying=True` this waits
+        for the disk and the database without a time limit. A store in memory stays open. Raises
+        StoreError while another thread uses the engine.
         """
         with self._exclusive:
             if self._outbox.is_usable:
@@ -506,20 +515,24 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         decision_id: str | None = None,
         timed_out: bool = False,
     ) -> Decision:
-        """Decide on one trace, and record the decision.
+        """Decide whether the part of a trace is verified, accepted or rejected; record this.
 
         Before that, a version that the executor has trained is taken one step further (the steps
-        are test, store, put in force; in a product all are taken, after the other cells' news, and
-        the call waits for the store), and accepted parts without a report are confirmed
-        (`Policy(stops="all")`) or counted as unreported. A rule that lacks a correction is put
-        right, as by `flush`. After the decision, checks that have become overdue update the rule;
-        then, if a safe mode began or ended, an event is recorded, and `on_safe_mode` is called. For
+        are test, store, put in force; in a product, robot cells that share labels and versions, all
+        are taken, after what the other cells stored, and the call waits for the store). Accepted
+        parts without a report are confirmed as good with `Policy(stops="all")`, under which every
+        bad one is reported in time; else they are counted as unreported. If the decision rule was
+        updated with a wrong outcome, it is put right, as by `flush`. After the decision, checks
+        without a report for too long (`Policy.label_within`) update the rule as wrong decisions;
+        then, if a safe mode (after an alarm, parts are verified until new outcomes are good) began
+        or ended, an event (a row in the store's log) is recorded, and `on_safe_mode` is called. For
         an id that has a decision nothing of this is done, and that decision is returned.
 
         Parameters
         ----------
         trace : array, shape (samples,) or (channels, samples)
-            The first trace without a fault sets the `TraceSpec`, if none is in force.
+            The first trace without a fault (like a NaN) sets the `TraceSpec` (the shape of all
+            traces), if none is in force.
         part : str or int, optional
             The part's number. The labels of a part that comes again count less than those of
             different parts, and not at all for this part itself.
@@ -548,8 +561,9 @@ class DataEngine(AbstractContextManager["DataEngine"]):
             For a wrong shape, values that are no real numbers, a first trace of less than 10
             samples, an id that belongs to another trace, and an invalid part number.
         SettingError
-            For a first trace that the policy's force limits do not fit, and, while settings are
-            saved, for a `TraceSpec` that contradicts that of another robot cell of the product.
+            For a first trace that the policy's force limits (an operator's limits of the signal) do
+            not fit, and, while settings are saved, for a `TraceSpec` that contradicts that of
+            another robot cell of the product.
         ReportError
             For an invalid id, and with `timed_out` for none.
         StoreError
@@ -575,14 +589,15 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         """Decide on one trace by the model, record the decision and return it.
 
         These are the steps. The trace is converted, so that a wrong trace raises before it could
-        confirm an earlier part. A rule that lacks a correction is put right. Accepted parts that
-        nobody reported are confirmed (with `stops="all"`) or counted, which may change the rule.
-        The decision is made and recorded; without a `decision_id` it gets a new id. With a
-        `decision_id` the call waits until the decision is on disk; if the disk does not take it in
-        time, an ACCEPT or REJECT becomes VERIFY. The decision is then noted as a check or an
-        outcome that is waited for, and checks that are overdue count as wrong decisions, which may
-        change the rule, too. Raises what `DecisionMaker.convert` raises, before anything else is
-        done.
+        confirm an earlier part. If the decision rule, which learns from outcomes, was updated with
+        a wrong one, it is put right. Accepted parts that nobody reported are confirmed as good
+        (with `stops="all"`, under which every bad one is reported in time) or counted, which may
+        change the rule. The decision is made and recorded; without a `decision_id` it gets a new
+        id. With a `decision_id` the call waits until the decision is on disk; if the disk does not
+        take it in time, an ACCEPT or REJECT becomes VERIFY. The decision is then noted as a check
+        or an outcome that is waited for, and checks without a report for too long
+        (`Policy.label_within`) count as wrong decisions, which may change the rule, too. Raises
+        what `DecisionMaker.convert` raises, before anything else is done.
         """
         x = self._maker.convert(trace)
         self._learner.catch_up()
@@ -597,25 +612,29 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         """Report the outcome of a decision; once this returns, the label survives a power failure.
 
         (With a store in memory it ends with the process.) Before that, a version that the executor
-        has trained is taken one step further (the steps are test, store, put in force; in a product
-        all are taken). After the label is learned, a safe mode may begin or end (an event is
-        recorded, and `on_safe_mode` is called), and a retrain that is due runs in this thread or
-        begins in the executor. In a product, newer versions and corrections of the other robot
-        cells may be put in force, too. The label of a trace with a fault is stored; then no retrain
-        follows, and the other cells' news is left for later. If a report or the next decision had
-        confirmed the part as good already, the call also waits for the store, so that the rule is
-        corrected now; if the store does not answer, this happens later. For such a correction a
-        training under way is discarded and begins again, and a model that cannot take a label back,
-        like a handed-in model, is retrained in this thread, or, if it is pinned, fitted again.
+        has trained is taken one step further (the steps are test, store, put in force; in a
+        product, robot cells that share labels and versions, all are taken). After the label is
+        learned, a safe mode (after an alarm, parts are verified until new outcomes are good) may
+        begin or end; then an event (a row in the store's log) is recorded, and `on_safe_mode` is
+        called. A retrain that is due runs in this thread or begins in the executor. In a product,
+        newer versions of the other cells and their changes of labels may be taken over, too. The
+        label of a trace with a fault, like a NaN, is stored, but not learned; no retrain follows
+        then, and what the other cells stored is left for later.
+
+        If a report or the next decision had confirmed the part as good already, the call also waits
+        for the store, so that the decision rule is corrected now; if the store does not answer,
+        this happens later. For such a correction a training under way is discarded and begins
+        again, and a model that cannot take a label back, like one that the user handed in, is
+        retrained in this thread, or, if it is pinned (kept in force by `rollback`), fitted again.
 
         Parameters
         ----------
         decision_id : str
         success : bool
-            The result of the verification; False for a line stop after an accept, True for a part
-            known to be good. A line stop that comes after the part was confirmed, however late,
-            takes the confirmation back and counts as a correction. If somebody inspected a rejected
-            part, its label is used for training, but does not update the rule.
+            The result of the verification; False if an accepted part was bad and stopped the line,
+            True for a part known to be good. A line stop that comes after the part was confirmed as
+            good, however late, takes the confirmation back and counts as a correction. If somebody
+            inspected a rejected part, its label is used for training, but does not update the rule.
 
         Returns
         -------
@@ -632,8 +651,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
             trace is damaged: nothing is learned. Also for an engine that is closed, was opened for
             reading or before a fork, or is in use by another thread.
         Exception
-            What the copying of a handed-in model raises, before a retrain; the label is on disk
-            then.
+            What the copying of a model that the user handed in raises, before a retrain; the label
+            is on disk then.
         """
         label = as_success(success)  # refused before anything is written
         id_ = as_id(decision_id)
@@ -701,10 +720,11 @@ class DataEngine(AbstractContextManager["DataEngine"]):
     def _run(self, cell: Cell, cycles: int) -> Iterator[Cycle]:
         """Yield a record of each cycle; at the end, also after an error, write everything to disk.
 
-        Before the first cycle it waits until a retrain could begin without delay, and takes from
-        the cell's `spec` what the engine does not know about the traces yet. From then until the
-        end the garbage collector ignores the objects that exist at that moment. Raises the errors
-        of `run`, for example NotTakenError if the disk does not take everything within 10 seconds.
+        A cycle is what the cell does with one part. Before the first cycle this waits until a
+        retrain could begin without delay, and takes from the cell's `spec`, a `TraceSpec`, what the
+        engine does not know about the traces yet. From then until the end the garbage collector
+        ignores the objects that exist at that moment. Raises the errors of `run`, for example
+        NotTakenError if the disk does not take everything within 10 seconds.
         """
         self._wait_until_warm()
         spec = getattr(cell, "spec", None)
@@ -720,16 +740,16 @@ class DataEngine(AbstractContextManager["DataEngine"]):
             self.flush(LONG_WAIT)
 
     def _cycle(self, cell: Cell, index: int) -> Cycle:
-        """Have the robot cell insert one part, decide, do what the decision says, and report the
-        outcome.
+        """Run a cycle: insert a part, decide, act on the decision, and report the outcome.
 
-        `index` is the number of the cycle, from 0. A REJECT is not reported, nor is an ACCEPT if
-        the cell does not know its outcome. A label that cannot be written to the disk is logged,
-        and written later. A retrain that is due is begun or done (`poll`). An exception of the cell
-        is raised unchanged, and so are the other errors of `decide`, `report` and `poll`;
-        ReportError is raised if the cell returns no label or outcome. Returns the record of the
-        cycle; its `decide_seconds` is the duration of the decision alone, during which Python's
-        garbage collector is off.
+        `index` is the number of the cycle, from 0. The robot cell inserts the part, and then
+        verifies it, lets it go on or rejects it. A REJECT is not reported, nor is an ACCEPT if the
+        cell does not know its outcome. A label that cannot be written to the disk is logged, and
+        written later. A retrain that is due is begun or done (`poll`). An exception of the cell is
+        raised unchanged, and so are the other errors of `decide`, `report` and `poll`; ReportError
+        is raised if the cell returns no label or outcome. Returns the record of the cycle; its
+        `decide_seconds` is the duration of the decision alone, during which Python's garbage
+        collector is off.
         """
         trace = cell.insert()
         with uncollected():
@@ -767,16 +787,18 @@ class DataEngine(AbstractContextManager["DataEngine"]):
     def retrain(self, wait: bool) -> RetrainReport | None: ...
 
     def retrain(self, wait: bool = True) -> RetrainReport | None:
-        """Retrain now, in this thread, and return the report.
+        """Retrain now and return the report; with `wait` False begin to retrain in the executor.
 
-        A version that is pinned by a rollback is released first. In a product newer versions,
-        corrections and labels of the other robot cells are taken in. A retrain that fails, has no
-        label to train on, or cannot be stored, is dropped: the report has `accepted` False then. If
-        a version was pinned, its release announces a safe mode that began or ended; otherwise the
-        next `decide`, `report` or `poll` does. Raises StoreError if the release of a pinned version
-        cannot be stored, if the labels that came before cannot be stored, in a product if the store
-        does not answer, and for an engine that is closed, was opened for reading or before a fork,
-        or is in use by another thread. What the copying of a handed-in model raises is raised, too.
+        A version that is pinned (kept in force by `rollback`) is released first. In a product
+        (robot cells that share labels and versions) newer versions, labels and changes of labels of
+        the other cells are taken in. A retrain that fails, has no label to train on, or cannot be
+        stored, is dropped: the report has `accepted` False then. If a version was pinned, its
+        release announces a safe mode (after an alarm, parts are verified until new outcomes are
+        good) that began or ended; otherwise the next `decide`, `report` or `poll` does. Raises
+        StoreError if the release of a pinned version cannot be stored, if the labels that came
+        before cannot be stored, in a product if the store does not answer, and for an engine that
+        is closed, was opened for reading or before a fork, or is in use by another thread. What the
+        copying of a model that the user handed in raises is raised, too.
 
         Parameters
         ----------
@@ -815,18 +837,19 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         steps are test, store, put in force). A training that is not done is not waited for. Without
         an executor a retrain that is due runs here, also with `brief`. Before a retrain begins,
         also one in the executor, the call waits until the store has all labels; if it does not take
-        them in time, or has a fault, the retrain waits for a later call. In a product, newer
-        versions and corrections of the other robot cells are put in force, which are looked for
-        once a second, and also when a retrain is due or its training is done. If a safe mode began
-        or ended, an event is recorded, and `on_safe_mode` is called.
+        them in time, or has a fault, the retrain waits for a later call. In a product (robot cells
+        that share labels and versions), newer versions of the other cells and their changes of
+        labels are taken over; they are looked for once a second, and also when a retrain is due or
+        its training is done. If a safe mode (after an alarm, parts are verified until new outcomes
+        are good) began or ended, an event (a row in the store's log) is recorded, and
+        `on_safe_mode` is called.
 
         Parameters
         ----------
         brief : bool, default False
             True: if the executor has trained a version, take it only one step further; the longest
             step, the test, takes some tens of milliseconds. False: take it through all steps, until
-            it is in force or is dropped. In a cell of a product, whose cells share labels and
-            versions, it is always taken through all steps.
+            it is in force or is dropped. In a product it is always taken through all steps.
 
         Returns
         -------
@@ -841,7 +864,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
             While another thread uses the engine, and if it is closed, was opened for reading or
             before a fork.
         Exception
-            What the copying of a handed-in model raises, before a retrain.
+            What the copying of a model that the user handed in raises, before a retrain.
         """
         self._outbox.check_usable()
         with self._exclusive:
@@ -896,14 +919,14 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         """Return bounds, at confidence 1 - alpha, on the errors of the decisions without a check.
 
         One is on the mean probability that an accepted part was bad, the other that a rejected part
-        was good. They follow from audits, random checks of parts of which the model was certain;
-        the first follows from the outcomes of the accepted parts if all are known. Without either a
-        bound is 1. Before that, everything is written to the disk, and to the store if it answers
-        (`flush`); what the store does not take in time does not count. Decisions since the last
-        change of policy count. With `stops="all"` (every bad accepted part is reported) accepted
-        parts of unknown outcome are left out. A forgotten (withdrawn) label and an overdue audit
-        (without a label in time) count as wrong decisions. Raises NotTakenError if not everything
-        is on disk in time, and StoreError if the store cannot be read.
+        was good. They follow from audits, random checks of parts that the model would accept or
+        reject; the first follows from the outcomes of the accepted parts if all are known. Without
+        either a bound is 1. Before that, everything is written to the disk, and to the store if it
+        answers (`flush`); what the store does not take in time does not count. Decisions since the
+        last change of policy count. With `stops="all"` (every bad accepted part is reported)
+        accepted parts of unknown outcome are left out. A forgotten (withdrawn) label and an overdue
+        audit (without a label in time) count as wrong decisions. Raises NotTakenError if not
+        everything is on disk in time, and StoreError if the store cannot be read.
         """
         self.flush()
         policy = self.policy
@@ -1009,14 +1032,15 @@ def _new_settings(
 ) -> tuple[EngineSettings, EngineModel]:
     """Return the settings of a new engine, and the untrained model that they describe.
 
-    `given` holds the settings that the caller passed beside the recipe, by name. They replace those
-    of the recipe; None is not given. For a handed-in `model` without a recipe, the other settings
-    are those of the default recipe, but `retrain_every` is that of `Reducer`, not of conv. Raises
-    SettingError if `reducer`, or a setting in `given`, has no effect on such a model; those in
-    `recipe` are not refused. Raises it also for settings that are out of range or contradict each
-    other, if the reducer or the rule cannot be made, for a `model` that `BaselineAdapter` refuses,
-    and if the training window is smaller than the model's `min_traces`. Other errors of the
-    constructor of a user's class are raised as they are.
+    A recipe holds all settings. `given` holds the settings that the caller passed beside `recipe`,
+    by name. They replace those of the recipe; a setting of None counts as not given. For a `model`
+    that the user handed in, without a recipe, the other settings are those of the default recipe,
+    but `retrain_every` is that of `Reducer`, not of the reducer conv. Raises SettingError if
+    `reducer`, or a setting in `given`, has no effect on such a model; those in `recipe` are not
+    refused. Raises it also for settings that are out of range or contradict each other, if the
+    reducer or the decision rule cannot be made, for a `model` that `BaselineAdapter` refuses, and
+    if the training window (the number of newest labels) is smaller than the model's `min_traces`.
+    Other errors of the constructor of a user's class are raised as they are.
     """
     if model is not None:
         check_model_settings(reducer, given)

@@ -99,15 +99,17 @@ class Feedback:
         return self._settings.now.recipe.policy.stops == "all"
 
     def resume(self) -> None:
-        """Restore from the store the pending checks, and the accepted parts without an outcome.
+        """Restore checks without a report, and accepted parts without an outcome, from the store.
 
-        The model in force and its rule must be restored before. Overdue checks and checks from
-        before the present rule are left out, as are accepted parts from before the present policy.
-        With `stops="all"` the accepted parts are kept, so that the next trace confirms them. With
-        "some" they are only counted, as unreported since the last label. A safe mode that the rule
-        is in already is not announced again, by no event and no call of the user's function
-        `on_safe_mode`. Raises StoreError if the store cannot be read, or with `stops="all"` the
-        trace of such a part is damaged.
+        The model in force and its decision rule must be restored before. Left out are overdue
+        checks (without a report for `Policy.label_within` decisions or more), checks from before
+        the present rule began, and accepted parts from before the present policy. With
+        `stops="all"`, under which every bad accepted part is reported in time, the accepted parts
+        are kept, so that the next trace confirms them as good. With "some" they are only counted,
+        as unreported since the last label. A safe mode that the rule is in already (parts are
+        verified until new outcomes are good) is not announced again, by no event and no call of the
+        user's function `on_safe_mode`. Raises StoreError if the store cannot be read, or with
+        `stops="all"` the trace of such a part is damaged.
         """
         self._safe_mode = self._live.newest.safe_mode
         store = self._outbox.store
@@ -125,10 +127,11 @@ class Feedback:
                 self._unreported[id_] = accepted
 
     def record_decision(self, stored: StoredDecision) -> None:
-        """Note a new decision: VERIFY as a pending check, ACCEPT as a part without an outcome.
+        """Note a new decision: a VERIFY waits for its check, an ACCEPT for the outcome of the part.
 
-        A VERIFY of a trace with a fault is not pending. The rule counts each check that has become
-        overdue as a wrong decision (`_count_overdue`).
+        A VERIFY of a trace with a fault, like a NaN, is not noted, nor is a REJECT. The decision
+        rule counts each check that has become overdue (no report within `Policy.label_within` later
+        decisions) as a wrong decision (`_count_overdue`).
         """
         decision = stored.decision
         if decision.action is Action.VERIFY and not stored.quarantined:
@@ -141,11 +144,11 @@ class Feedback:
         """Confirm or count the accepted parts without an outcome, because the next trace has come.
 
         With `Policy(stops="all")`, under which a bad part would have stopped the line, each part
-        counts as good: rule and references learn it now, and its label, CONFIRMED, is recorded
-        without waiting for the disk, and counts as new. An exception of rule or model is logged,
-        not raised, and a part from before the present rule began does not update the rule. With
-        "some" the parts are only counted, and nothing is learned. Either way they wait for an
-        outcome no longer.
+        counts as good: the decision rule and the references (labelled points that new traces are
+        compared with) learn it now, and its label, CONFIRMED, is recorded without waiting for the
+        disk, and counts as new. An exception of rule or model is logged, not raised, and a part
+        from before the present rule began does not update the rule. With "some" the parts are only
+        counted, and nothing is learned. Either way they wait for an outcome no longer.
         """
         while self._unreported:
             _, stored = self._unreported.popitem(last=False)
@@ -155,18 +158,20 @@ class Feedback:
                 self._n_unreported += 1
 
     def take_in(self, stored: StoredDecision, success: bool) -> None:
-        """Learn a reported label and hand it to the outbox, without waiting for the disk.
+        """Learn a reported label and record it, without waiting for the disk.
 
         `stored` is the decision with the label that it has so far, on disk or not, if any. If the
         same report comes again before its label is known to be on disk (`note_synced`), nothing is
-        done. If the decision has a label already, ReportError is raised, with one exception: a line
-        stop may follow the confirmation of a part, by a report or by the next decision
-        (`Policy(stops="all")`). Such a line stop is recorded, and learned later, as a correction.
-        The attribute `remedy` is set if the rule must be rebuilt, which is not done here. An
-        exception of rule or model is logged, not raised.
+        done. If the decision has a label already, ReportError is raised, with one exception: an
+        accepted part that was confirmed as good, by a report or by the next decision
+        (`Policy(stops="all")`), may be reported as bad, because it stopped the line. Such a line
+        stop is recorded, and learned later, as a correction. The attribute `remedy` is set if the
+        decision rule must be rebuilt, which is not done here. An exception of rule or model is
+        logged, not raised.
 
-        A label that is learned counts as new and enters the training window; in a product it enters
-        the window later, from the store. The label of a trace with a fault is only recorded. The
+        A label that is learned counts as new and enters the training window (the newest labelled
+        traces); in a product (robot cells that share labels and versions) it enters the window
+        later, from the store. The label of a trace with a fault, like a NaN, is only recorded. The
         part waits for an outcome or a check no longer.
         """
         id_ = stored.decision.id
@@ -182,13 +187,14 @@ class Feedback:
         del self._unsynced[decision_id]
 
     def _take_in_new(self, stored: StoredDecision, success: bool) -> None:
-        """Learn a label that is no repetition, and hand it to the outbox.
+        """Learn a label that is no repetition of an earlier report, and record it.
 
         `stored` is the decision with the label that it has so far. If a report or the next decision
-        had confirmed the part as good (CONFIRMED), a line stop is recorded but not learned yet, and
-        `remedy`, which says what must be done later, is set to CORRECT. It is set to REBUILD_RULE,
-        unless it is set already, if the rule had counted the part's check as overdue. Raises
-        ReportError for any other report on a decision with a label; then nothing is changed.
+        had confirmed an accepted part as good (CONFIRMED), the report that it was bad and stopped
+        the line is recorded but not learned yet, and `remedy`, which says what must be done later,
+        is set to CORRECT. It is set to REBUILD_RULE, unless it is set already, if the decision rule
+        had counted the part's check as overdue, and so as wrong. Raises ReportError for any other
+        report on a decision with a label; then nothing is changed.
         """
         decision = stored.decision
         source = source_of(decision, success)
@@ -209,20 +215,22 @@ class Feedback:
             self.remedy = self.remedy or Remedy.REBUILD_RULE
 
     def _learn_and_record(self, stored: StoredDecision, success: bool, source: Source) -> None:
-        """Update rule and references with the outcome of a part, and have its label recorded.
+        """Update decision rule and references with the outcome of a part, and record its label.
 
-        `source` says where the label comes from. A trace with a fault updates neither. An exception
-        of the model or the rule is logged and not raised; if the rule raised, it is stale, and
-        every part is verified. The label of a rejected part that was inspected becomes a reference
-        and does not update the rule: which parts are inspected is somebody's choice, and no sample.
-        Every other label of a trace without a fault also tells the rule how many accepted parts
-        went on unreported since the last label, and this count begins again at 0, even if the
-        decision is from before the present rule and so does not update it. A part that was counted
-        among them is subtracted from the number that its own label tells, which may make it -1.
+        References are labelled points that new traces are compared with. `source` says where the
+        label comes from. A trace with a fault, like a NaN, updates neither. An exception of the
+        model or the rule is logged and not raised; if the rule raised, it is stale (every part is
+        then verified). The label of a rejected part that was inspected becomes a reference and does
+        not update the rule: which parts are inspected is somebody's choice, and no sample. Every
+        other label of a trace without a fault also tells the rule how many accepted parts went on
+        unreported since the last label, and this count begins again at 0, even if the decision is
+        from before the present rule began and so does not update it. A part that was counted among
+        them is subtracted from the number that its own label tells, which may make it -1.
 
-        The label takes the next number of the outbox. The label of a trace without a fault counts
-        as new and enters the training window; in a product it is read into that from the store,
-        later.
+        The label takes the next number of the outbox, which records it. The label of a trace
+        without a fault counts as new and enters the training window (the newest labelled traces);
+        in a product (robot cells that share labels and versions) it is read into that from the
+        store, later.
         """
         decision = stored.decision
         number = self._outbox.number_label()
@@ -253,10 +261,10 @@ class Feedback:
             self._provisional[decision.id] = number
 
     def _was_unreported(self, stored: StoredDecision) -> bool:
-        """Return whether this part is one of those counted as unreported.
+        """Return whether this part was counted as unreported: accepted, and nobody reported it.
 
-        It is, if it was accepted by a version under the present policy, which has stops="some", and
-        the next trace came before its outcome.
+        It was, if it was accepted by a version under the present policy, which has stops="some"
+        (not every bad accepted part is reported), and the next trace came before its outcome.
         """
         decision = stored.decision
         if decision.action is not Action.ACCEPT or self._stops_all:
@@ -265,13 +273,15 @@ class Feedback:
         return decision.id not in self._unreported and is_of_policy
 
     def number_labels(self) -> None:
-        """In a product, give this cell's references the numbers that their labels got in the store.
+        """In a product, give this cell's references the numbers that the store gave their labels.
 
-        A product is several robot cells whose labels have one sequence of numbers in the store.
-        With or without a product, the rule first counts each check that has become overdue as a
-        wrong decision; if this fails, it is logged, and the rule is stale. The store is not asked:
-        the outbox keeps the numbers of the labels that it has written to the store, and gives each
-        number once. Labels of traces with a fault are passed over, and without a model in force no
+        A product is several robot cells whose labels have one sequence of numbers in the store;
+        references are labelled points that new traces are compared with. With or without a product,
+        the decision rule first counts each overdue check (no report within `Policy.label_within`
+        later decisions) as a wrong decision; if this fails, it is logged, and the rule is stale
+        (every part is then verified). The store is not asked: the outbox, which records labels,
+        keeps the numbers of those that it has written to the store, and gives each number once.
+        Labels of traces with a fault, like a NaN, are passed over, and without a model in force no
         reference changes. Nothing is raised.
         """
         self._count_overdue()
@@ -294,15 +304,16 @@ class Feedback:
         self.new_labels += n_labels
 
     def _count_overdue(self) -> None:
-        """Update the rule with each decision whose check has become overdue, as with a wrong one.
+        """Update the decision rule as with a wrong decision for each check that became overdue.
 
         A check is overdue if `Policy.label_within` or more decisions followed, and it has no report
         yet. Each is examined once (`LiveModel.count_overdue`): its id goes to `LiveModel.overdue`,
         and it updates the rule as a failure if its lower bound is above 0, and as a success if its
-        upper bound is below 1; so it may update it twice. A decision with the bound (0, 1), which
-        says nothing, or from before the present rule began, is not counted. A failed update is
-        logged, and the rule is stale then. `LiveModel.overdue_to` becomes the newest number that
-        was examined; nothing changes if that is not larger than before.
+        upper bound is below 1; so it may update it twice. The bounds are those of the success
+        probability. A decision with the bound (0, 1), which says nothing, or from before the
+        present rule began, is not counted. A failed update is logged, and the rule is stale (every
+        part is then verified). `LiveModel.overdue_to` becomes the newest number that was examined;
+        nothing changes if that is not larger than before.
         """
         overdue_to = self._outbox.n_decisions - self._settings.now.recipe.policy.label_within
         if overdue_to <= self._live.overdue_to:
@@ -335,13 +346,14 @@ class Feedback:
     def announce_safe_mode(self, reason_ended: str = "fresh evidence keeps the tolerance") -> None:
         """Record and announce that a safe mode began or ended since the last call; else do nothing.
 
-        An event is recorded, then the user's function `on_safe_mode` is called. It gets the reason
-        of a safe mode that began, or "" if it ended; then the event says `reason_ended`. A safe
-        mode begins after an alarm of the rule. If another alarm changes the reason of a safe mode,
-        it is announced once more, as one that began. What changed and changed back between two
-        calls is not announced. If the event cannot be recorded, the user's function is not called.
-        This, like an exception of the function, is logged, and nothing is tried again. Callers do
-        this only after labels are stored, so that such a failure costs no label.
+        In a safe mode, which begins after an alarm of the decision rule, parts are verified until
+        new outcomes are good. An event (a row in the store's log) is recorded, then the user's
+        function `on_safe_mode` is called. It gets the reason of a safe mode that began, or "" if it
+        ended; then the event says `reason_ended`. If another alarm changes the reason of a safe
+        mode, it is announced once more, as one that began. What changed and changed back between
+        two calls is not announced. If the event cannot be recorded, the user's function is not
+        called. This, like an exception of the function, is logged, and nothing is tried again.
+        Callers do this only after labels are stored, so that such a failure costs no label.
         """
         safe_mode = self._live.newest.safe_mode
         if safe_mode == self._safe_mode:

@@ -53,12 +53,13 @@ class Peers:
         return self._clock() - self._looked >= LOOK_SECONDS
 
     def look(self) -> tuple[int, int]:
-        """Return the numbers of the product's newest version and of its newest correction.
+        """Return the numbers of the product's newest version and newest correction of a label.
 
-        The first is 0 if there is no version that is newer than the one in force; a version that
-        could not be put in force does not count. Raises StoreError if the store fails or gives no
-        answer in time. Also after an error, the next look is due LOOK_SECONDS (1 s) after this one
-        began (`is_look_due`).
+        A product is several robot cells that share labels and versions. The first number is 0 if
+        there is no version that is newer than the one in force here; a version that could not be
+        put in force does not count. Raises StoreError if the store fails or gives no answer in
+        time. Also after an error, the next look is due LOOK_SECONDS (1 s) after this one began
+        (`is_look_due`).
         """
         self._looked = self._clock()
         store = self._outbox.store
@@ -71,9 +72,9 @@ class Peers:
     def note_answer(self, error: StoreError | None) -> None:
         """Log that the store gave no answer, or that it answers again.
 
-        `error` is that of the last attempt to ask the store for versions and corrections of the
-        product's other robot cells; None: it answered. Only the first of several failures is
-        logged, and only the first answer after a failure.
+        `error` is that of the last attempt to ask the store for what the product's other cells
+        (robot cells that share labels and versions) stored; None: it answered. Only the first of
+        several failures is logged, and only the first answer after a failure.
         """
         product = self._outbox.store.product
         if error is None and self._is_lost:
@@ -85,14 +86,16 @@ class Peers:
         self._is_lost = error is not None
 
     def read_labels(self) -> None:
-        """Add to the training window all cells' labels that came after its newest label.
+        """Add all cells' labels that came after its newest label to the training window.
 
-        If more labels came than the window holds, only the newest are read. They are read with the
-        corrections up to `LiveModel.corrected_to`; a full window loses its oldest label. Labels of
-        traces with a fault and forgotten labels are left out, and so are labels of damaged traces,
-        for which an event is written to the store. There is no time limit. Raises StoreError, and
-        adds nothing, if the store cannot be read, the traces have different shapes, or a label is
-        neither 0 nor 1.
+        The training window holds the newest labelled traces, and the cells are those of the product
+        (robot cells that share labels and versions). If more labels came than the window holds,
+        only the newest are read. They are read with the corrections (later changes of labels) up to
+        `LiveModel.corrected_to`; a full window loses its oldest label. Labels of traces with a
+        fault, like a NaN, and forgotten (withdrawn) labels are left out, and so are labels of
+        damaged traces, for which an event (a row in the store's log) is recorded. There is no time
+        limit. Raises StoreError, and adds nothing, if the store cannot be read, the traces have
+        different shapes, or a label is neither 0 nor 1.
         """
         labelled = self._outbox.store.labels.with_traces(
             self._window.capacity,
@@ -103,20 +106,22 @@ class Peers:
             self._window.add(trace, label, hash_, seq)
 
     def put_in_force(self, number: int) -> bool:
-        """Put a version that another robot cell of the product stored in force, with this cell's
-        labels.
+        """Put a version of another cell of the product in force, with this cell's labels.
 
-        It gets the present decision rule of this cell: nothing is rebuilt, and the other cell's
-        rule is ignored. A failure to take over the rule is logged, and the version is in force all
-        the same. This cell's labels since the version become its references, and corrections since
-        then are applied (`add_labels_since`), without a time limit. A damaged trace is reported by
-        an event in the store.
+        A product is several robot cells that share labels and versions. The version gets the
+        present decision rule of this cell: nothing is rebuilt, and the other cell's rule is
+        ignored. A failure to take over the rule is logged, and the version is in force all the
+        same. This cell's labels since the version become its references (labelled points that new
+        traces are compared with), and corrections (changes of labels) since then are applied
+        (`add_labels_since`), without a time limit. A damaged trace is reported by an event (a row
+        in the store's log).
 
         A model like umap-learn is fitted again. The labels that it is fitted on are checked against
-        the ledger; a difference sets the outbox's `integrity_error`, after which every part is
-        verified. If one of these traces is damaged or missing, if the version is damaged, not kept
-        or of another model, or if the model raises an error that is no StoreError, that is logged,
-        the present version stays in force, and `look` does not return this number again.
+        the ledger (the store's hash chain); a difference sets the outbox's `integrity_error`, after
+        which every part is verified. If one of these traces is damaged or missing, if the version
+        is damaged, not kept or of another model, or if the model raises an error that is no
+        StoreError, that is logged, the present version stays in force, and `look` does not return
+        this number again.
 
         Returns whether the version is in force now. Raises StoreError if the store cannot be read;
         `look` then returns the number again.

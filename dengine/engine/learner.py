@@ -94,18 +94,19 @@ class Learner:
         self._start: tuple[tuple[int, int], EngineModel, str] | None = None
 
     def resume(self, label_within: int, policy_since: int) -> None:
-        """Restore training window, version, rule and counts from the store.
+        """Restore training window, version, decision rule and count of new labels from the store.
 
-        It is called when an engine opens the store. The newest version whose arrays are intact is
-        restored bit for bit; but a model of which the store has only the numbers of its traces is
-        trained on them again, and if one of these is damaged or missing, no model is in force.
-        Damaged arrays and traces are reported by events in the store. A difference between store
-        and ledger (its hash chain) sets the outbox's `integrity_error`. `label_within` is the
-        number of later decisions after which a check without a report is overdue, and
-        `policy_since` the first version under the policy in force. If a model is in force, or the
-        training window has at least IMPORTED labels (500), this also starts a thread that computes
-        in advance for the next retrain (`precompute`). Raises StoreError if the store cannot be
-        read, and the other errors of `LiveModel.resume`.
+        It is called when an engine opens the store. The training window holds the newest labelled
+        traces. The newest version whose arrays are intact is restored bit for bit; but a model of
+        which the store has only the numbers of its traces is trained on them again, and if one of
+        these is damaged or missing, no model is in force. Damaged arrays and traces are reported by
+        events (rows in the store's log). A difference between store and ledger (its hash chain)
+        sets the outbox's `integrity_error`, after which every part is verified. `label_within` is
+        the number of later decisions after which a check without a report is overdue (it counts as
+        a wrong decision), and `policy_since` the first version under the policy in force. If a
+        model is in force, or the training window has at least IMPORTED labels (500), this also
+        starts a thread that computes in advance for the next retrain (`precompute`). Raises
+        StoreError if the store cannot be read, and the other errors of `LiveModel.resume`.
         """
         version = self._store.versions.newest()
         reports = self._store.versions.retrains()
@@ -118,11 +119,12 @@ class Learner:
             self.precompute()
 
     def _refill_window(self, corrected_to: int) -> None:
-        """Read the training window from the store, and count the new labels again.
+        """Read the training window (newest labelled traces) from the store; count the new labels.
 
-        Corrections up to the number `corrected_to` are applied. A label is new if its number is
-        above `counts_from` of the version in force (`TrainedOn`). A damaged trace is left out, and
-        reported by an event in the store. Raises StoreError if the store cannot be read.
+        Corrections (later changes of labels) up to the number `corrected_to` are applied. A label
+        is new if its number is above `counts_from` of the version in force (`TrainedOn`). A damaged
+        trace is left out, and reported by an event (a row in the store's log). Raises StoreError if
+        the store cannot be read.
         """
         self._window.refill(
             self._store.labels.with_traces(self._window.capacity, corrected_to=corrected_to)
@@ -132,11 +134,11 @@ class Learner:
     def precompute(self) -> None:
         """Start a thread that computes in advance what the next training needs; do not wait for it.
 
-        These are above all the features of the traces in the training window. They are kept in the
-        model that the training starts from. If labels were corrected, this call first looks for
-        that model in the store, without a time limit (`_choose_start`). A failure is logged.
-        Nothing is started if the training window is empty, or if `wait_until_precomputed` has not
-        waited for an earlier thread yet.
+        These are above all the features of the traces in the training window (the newest labelled
+        traces). They are kept in the model that the training starts from. If labels were corrected,
+        this call first looks for that model in the store, without a time limit (`_choose_start`). A
+        failure is logged. Nothing is started if the training window is empty, or if
+        `wait_until_precomputed` has not waited for an earlier thread yet.
         """
         if self._precomputed is not None or not len(self._window):
             return
@@ -154,15 +156,16 @@ class Learner:
         """Give labels the numbers that the store assigned, and put the rule right if it must be.
 
         The store assigns numbers only in a product (robot cells that share labels and versions).
-        Checks whose report is overdue count as wrong, too. The rule must be put right
-        (`Feedback.remedy`) after it learned a wrong outcome: it is rebuilt, or all corrections that
-        the store has by now are applied and it is rebuilt. This waits for a later call while the
-        store lacks any record or has a fault. Before a correction a retrain under way is ended
-        (`end_training`), and the store is checked against its ledger (its hash chain): after a
-        difference every part is verified. A model that cannot change its references is retrained
-        here, or, if it is pinned, fitted again. Nothing is raised: if the store fails meanwhile,
-        that is logged, and a later call tries again; any other exception, for example of a model
-        that is fitted again, is logged, and it is not tried again.
+        Checks whose report is overdue count as wrong decisions, too. The decision rule must be put
+        right (`Feedback.remedy`) after it learned a wrong outcome: it is rebuilt from the stored
+        outcomes; if a stored label was changed, all changes that the store has by now are first
+        applied to what the model learned. This waits for a later call while the store lacks any
+        record or has a fault. Before such changes a retrain under way is ended (`end_training`),
+        and the store is checked against its ledger (its hash chain): after a difference every part
+        is verified. A model that cannot change the label of a trace is retrained here, or, if it is
+        pinned (kept in force by a rollback), fitted again. Nothing is raised: if the store fails
+        meanwhile, that is logged, and a later call tries again; any other exception, for example of
+        a model that is fitted again, is logged, and it is not tried again.
         """
         self.feedback.number_labels()
         remedy = self.feedback.remedy
@@ -197,10 +200,11 @@ class Learner:
         """Train a version and put it in force, in this thread, or begin to in the executor.
 
         First every label is stored, since a version is trained only on labels that the store has
-        numbered. Then the call waits for what is computed in advance, and takes in what the
-        product's other robot cells stored (a newer version, corrections and labels), since these
-        may change what the training starts from. Then new labels count from zero, and the training
-        begins. Whether a rollback pinned the version in force is not checked.
+        numbered. Then the call waits for what is computed in advance, and takes in what other cells
+        of the product (robot cells that share labels and versions) stored (a newer version, changes
+        of labels, and labels), since these may change what the training starts from. Then new
+        labels count from zero, and the training begins. Whether a rollback pinned the version in
+        force, so that no retrain should replace it, is not checked.
 
         With `wait` True, or if no executor takes work (none is there, or it died or hangs), all is
         done in this thread, which then has one torch thread, and the report is returned. Otherwise
@@ -209,12 +213,12 @@ class Learner:
         executor, and the computing in advance is not done, the training is requested, and
         `retrain_if_due` begins it later.
 
-        A version that fails or cannot be stored is dropped, and the report says so. If the version
-        is stored, but labels that came since cannot be, it is put in force by a later call; its
-        report is returned all the same. Raises StoreError if the labels before the training cannot
-        be stored, and in a product if the store does not answer; no training begins then. What the
-        copying of a model that the user handed in raises is raised; no label counts as new then.
-        With `wait` True no training may be under way (`end_training`).
+        A version that fails or cannot be stored is dropped (not put in force), and the report says
+        so. If the version is stored, but labels that came since cannot be, it is put in force by a
+        later call; its report is returned all the same. Raises StoreError if the labels before the
+        training cannot be stored, and in a product if the store does not answer; no training begins
+        then. What the copying of a model that the user handed in raises is raised; no label counts
+        as new then. With `wait` True no training may be under way (`end_training`).
         """
         if not wait:
             if self.is_at_work:
@@ -244,14 +248,16 @@ class Learner:
         There are three reasons. First, `retrain_every` labels are new, and there are as many labels
         as the model needs for a training (`min_traces`). Second, the training of the version in
         force made some of its steps and not all, for example because the time budget ended it; this
-        is a reason only in a robot cell without a product, and only if the last retrain was not
-        dropped. Third, a retrain was requested earlier and could not begin then, or a training was
-        discarded and is to begin again. A pinned version is not replaced, and such a request is
-        withdrawn. What the copying of a model that the user handed in raises is raised.
+        is a reason only in a robot cell that shares no labels and versions with others, and not
+        after a retrain whose version was dropped (never put in force). Third, a retrain was
+        requested earlier and could not begin then, or a training was discarded and is to begin
+        again. A version that a rollback pinned is not replaced, and such a request is withdrawn.
+        What the copying of a model that the user handed in raises is raised.
 
-        In a product a newer version and corrections of labels of other cells are put in force
-        first, so a peer's version may be in force afterwards, even if nothing is trained here. They
-        are looked for once a second, and whenever a training can begin because labels are new.
+        In a product (robot cells that share labels and versions) a newer version and changes of
+        labels of other cells are taken over first, so another cell's version may be in force
+        afterwards, even if nothing is trained here. They are looked for once a second, and whenever
+        a training can begin because labels are new.
 
         Parameters
         ----------
@@ -264,9 +270,9 @@ class Learner:
         Returns
         -------
         RetrainReport or None
-            The report of a retrain that was done in this thread. None if there is no reason, if the
-            store or its journal has a fault, if the labels cannot be stored, if a training or its
-            preparation is under way, or if the executor now trains.
+            The report of a retrain that was done in this thread. None if there is no reason or the
+            version is pinned, if the store or its journal has a fault, if the labels cannot be
+            stored, if a training or its preparation is under way, or if the executor now trains.
         """
         peers = self._peers
         may_train = self._has_labels(retrain_every) and not (self.live.pinned or self.is_at_work)
@@ -337,15 +343,16 @@ class Learner:
         Taking the outcome is a step; the others test the version, store it and put it in force.
         With `to_the_end` all steps of a training that is done are taken, and the call waits for the
         store. Nothing happens if no training is under way, or while it is not done; but a training
-        that hangs (longer than 60 s), or whose executor died, is given up and dropped. A version
-        that cannot be stored is dropped. A version that is stored, but lacks newer labels that the
-        store does not take now, waits for a later call. Nothing is raised.
+        that hangs (longer than 60 s), or whose executor died, is given up and dropped (no version
+        of it is put in force). A version that cannot be stored is dropped, too. A version that is
+        stored, but lacks newer labels that the store does not take now, waits for a later call.
+        Nothing is raised.
 
         `wait` is the number of seconds to wait for a training that is not done; after that it is
         given up, and so is a training that hangs. In a product (robot cells that share labels and
         versions) all steps are taken in any case. When the training is done, or with `wait` above
-        0, the call first takes in what the other cells stored: a correction or a rollback discards
-        the training, and if the store is unavailable, the training waits for a later call.
+        0, the call first takes in what the other cells stored: a change of a label or a rollback
+        discards the training, and if the store is unavailable, the training waits for a later call.
         """
         if self._candidate is None and self._retrainer.future is None:
             return
@@ -367,9 +374,10 @@ class Learner:
     def _make_candidate(self, trained: Trained) -> Candidate:
         """Make the outcome of a training the candidate, the version on its way to be put in force.
 
-        It will take over the rule of the model in force. If the training started from another
-        model, because labels were forgotten, the reason in its report says from which. Returns the
-        candidate, whose steps (test, store, put in force) `_advance` takes; none is taken here.
+        It will take over the decision rule of the model in force. If the training started from
+        another model, because labels were forgotten (withdrawn), the reason in its report says from
+        which. Returns the candidate, whose steps (test, store, put in force) `_advance` takes; none
+        is taken here.
         """
         note = self._start[2] if self._start is not None else ""
         if note:
@@ -384,11 +392,12 @@ class Learner:
     def _choose_start(self) -> EngineModel:
         """Return the model that the next training starts from: one that saw no forgotten label.
 
-        (A model that begins anew with each training may have seen one; see `find_clean_start`.)
-        Without any correction it is the model in force, or the untrained model before the first
-        retrain. Otherwise `find_clean_start` chooses it from the store, and the choice is kept
-        until another version is in force or another correction comes. If that raises, whatever it
-        is, it is logged, and the training starts from initial weights.
+        Forgotten labels were withdrawn by a person. (A model that begins anew with each training
+        may have seen one; see `find_clean_start`.) If no label was ever corrected or forgotten, the
+        result is the model in force, or the untrained model before the first retrain. Otherwise
+        `find_clean_start` chooses it from the store, and the choice is kept until another version
+        is in force or another label is changed. If that raises, whatever it is, it is logged, and
+        the training starts from initial weights.
         """
         live = self.live
         if not live.corrected_to:  # nothing was ever forgotten, so the store need not be read
@@ -423,11 +432,11 @@ class Learner:
 
         With `to_the_end` it takes all steps that are left: test, learn newer labels, store, learn
         newer labels, put in force. No StoreError is raised: a candidate that cannot be stored, or
-        whose labels cannot be stored before it, is dropped. A candidate that is stored waits for a
-        later call if the newest labels cannot be stored, which is logged. A candidate without a
-        model, because its training or its test failed, is not put in force: only its report is
-        stored, and the previous version goes on. The time that this takes before it is stored
-        counts as work on the retrain, in its report.
+        whose labels cannot be stored before it, is dropped (never put in force). A candidate that
+        is stored waits for a later call if the newest labels cannot be stored, which is logged. A
+        candidate without a model, because its training or its test failed, is not put in force:
+        only its report is stored, and the previous version goes on. The time that this takes before
+        it is stored counts as work on the retrain, in its report.
         """
         candidate.begin_work()
         try:
@@ -448,7 +457,7 @@ class Learner:
         candidate.end_work()
 
     def _see_through(self, candidate: Candidate) -> Steps:
-        """Generate the steps of a candidate from its training until it is in force.
+        """Generate the steps that bring a trained version, the candidate, into force.
 
         It is tested first, so that a model that fails the test is never written to the store. It is
         stored with every label that came until then, and before it is in force: else a killed
@@ -457,9 +466,10 @@ class Learner:
         only the report is stored, and the previous version stays in force.
 
         Yields after each step: None, or, if the store has not done its part yet, a function that
-        waits for it. If the store has not begun to commit the version within the outbox's `limit`,
-        the step itself waits for it. Raises StoreError if the version cannot be stored. The
-        functions that it yields raise StoreError if the labels or the version cannot be stored.
+        waits for it. If the store has not begun to commit the version within the outbox's `limit`
+        (seconds that a call waits for the store), the step itself waits for it. Raises StoreError
+        if the version cannot be stored. The functions that it yields raise StoreError if the labels
+        or the version cannot be stored.
         """
         candidate.check()
         yield None
@@ -473,14 +483,16 @@ class Learner:
         self._swap(candidate)
 
     def _catch_up_candidate(self, candidate: Candidate) -> Steps:
-        """Add all labels that it lacks to the candidate's references, and have them stored.
+        """Add all labels that a candidate lacks to its references, and have them stored.
 
-        The candidate is a trained version that is not in force yet; a label that it cannot take is
-        logged and skipped. Each round first counts overdue checks and, in a product, takes over the
-        labels' numbers (`number_labels`). It yields None after each label, and a function that
-        waits for the store if labels are not stored yet; it ends when no label is missing or waits
-        to be stored. In a robot cell that never pauses some label always waits, so in every 20th
-        round this call waits for the store itself; a StoreError there is ignored.
+        The candidate is a trained version that is not in force yet; its references are labelled
+        points that new traces are compared with. A label that it cannot take is logged and skipped.
+        Each round first counts overdue checks (without a report in time) as wrong decisions and, in
+        a product (robot cells that share labels and versions), takes over the numbers that the
+        store gave the labels (`number_labels`). It yields None after each label, and a function
+        that waits for the store if labels are not stored yet; it ends when no label is missing or
+        waits to be stored. In a robot cell that never pauses some label always waits, so in every
+        20th round this call waits for the store itself; a StoreError there is ignored.
         """
         for n_waits in count(1):
             self.feedback.number_labels()
@@ -498,9 +510,10 @@ class Learner:
         """Complete the candidate's report; hand report and model to the thread that stores them.
 
         The candidate is a trained version that is not in force yet. Returns a future of the
-        version's number: the report's, or a higher one if another robot cell of the product stored
-        a version first. Without a model only the report is stored, and the number is the report's.
-        Raises StoreError if the store is unavailable. With a store in memory the future is done.
+        version's number: the report's, or a higher one if another cell of the product (robot cells
+        that share labels and versions) stored a version first. Without a model only the report is
+        stored, and the number is the report's. Raises StoreError if the store is unavailable. With
+        a store in memory the future is done.
         """
         report = candidate.complete_report(self.live.next_version)
         newest_seq = self._window.newest_seq
@@ -510,11 +523,11 @@ class Learner:
         return self._outbox.store_version(report, newest_seq, state)
 
     def _swap(self, candidate: Candidate) -> None:
-        """Put a stored candidate in force with the present rule; keep its report for `take_report`.
+        """Put a stored candidate (trained version) in force; keep its report for `take_report`.
 
-        A failure to take over the rule is logged. If the training was dropped, there is no model:
-        the previous version stays in force, the report is kept, and its reason is added to
-        `dropped`, which a version that is put in force empties.
+        It takes over the present decision rule; a failure of this is logged. If the training was
+        dropped, there is no model: the previous version stays in force, the report is kept, and its
+        reason is added to the list `dropped`, which a version that is put in force empties.
         """
         self._candidate = None
         self._report = candidate.report
@@ -527,12 +540,12 @@ class Learner:
             self.live.swap_in(candidate.model, candidate.report.version, candidate.trained_on)
 
     def _drop(self, candidate: Candidate, error: StoreError) -> None:
-        """Drop a candidate that could not be stored, and keep a report of this in memory only.
+        """Drop a candidate (trained version) that could not be stored; keep a report in memory.
 
-        It is logged, and the previous version stays in force. As many labels as its training had
-        are added to the count of new ones, so that the next retrain is soon. Its reason is added to
-        `dropped`. Training steps that the time budget cut off are then no reason for another
-        training (`retrain_if_due`).
+        It is logged with the `error`, and the previous version stays in force. As many labels as
+        its training had are added to the count of new ones, so that the next retrain is soon. The
+        reason in the report is added to `dropped`. Training steps that the time budget cut off are
+        then no reason for another training (`retrain_if_due`).
         """
         log.warning("a retrain was dropped, for it could not be stored: %s", error)
         self._candidate = None
@@ -559,10 +572,11 @@ class Learner:
     # The other cells of a product
 
     def _try_to_hear(self, peers: Peers, with_labels: bool = True) -> bool:
-        """Take in what peers stored (`_hear_of_peers`); return whether the store gave an answer.
+        """Take in what other cells stored (`_hear_of_peers`); return whether the store answered.
 
-        These are versions and corrections of the product's other robot cells, and the labels of all
-        cells if there is such news or with `with_labels`. If the store gave no answer, or this
+        The other cells are those of the product (robot cells that share labels and versions). What
+        they stored are versions and corrections (changes of labels); the labels of all cells are
+        read, too, if there is such news or with `with_labels`. If the store gave no answer, or this
         cell's labels could not be stored, the result is False; this is logged, once until it
         answers again, and nothing is raised.
         """
@@ -575,18 +589,20 @@ class Learner:
         return failure is None
 
     def _hear_of_peers(self, with_labels: bool = True) -> None:
-        """Put a newer version and corrections of the product's other robot cells in force.
+        """Take over a newer version and corrections that other cells of the product stored.
 
-        If there is a newer version or correction, or with `with_labels`, this cell's labels are
-        stored first, and the labels of all cells are read into the training window at the end. What
-        is read is checked against the ledger (the store's hash chain); a difference sets the
-        outbox's `integrity_error`, after which every part is verified. A version that cannot be
-        used is logged, and the present version stays in force (`Peers.put_in_force`). A pinned
-        version or a correction discards a training under way in the executor. A correction changes
-        one of the model's references (the labelled traces with which it compares a new one); a
-        model that cannot do so is not retrained here. After a newer version the new labels are
-        counted from those that it knows. Nothing happens in a cell without a product. Raises
-        StoreError if the store is unavailable.
+        A product is several robot cells that share labels and versions; a correction is a later
+        change of a label. If there is a newer version or correction, or with `with_labels`, this
+        cell's labels are stored first, and the labels of all cells are read into the training
+        window (the newest labelled traces) at the end. What is read is checked against the ledger
+        (the store's hash chain); a difference sets the outbox's `integrity_error`, after which
+        every part is verified. A version that cannot be used is logged, and the present version
+        stays in force (`Peers.put_in_force`). A correction, or a newer version that a rollback
+        pinned (no retrain may replace it), discards a training under way in the executor. A
+        correction changes one of the model's references (labelled points that new traces are
+        compared with); a model that cannot do so is not retrained here. After a newer version the
+        new labels are counted from those that it knows. Nothing happens in a cell without a
+        product. Raises StoreError if the store is unavailable.
         """
         peers = self._peers
         if peers is None:
@@ -621,17 +637,20 @@ class Learner:
         self._hear_of_peers()
 
     def apply_corrections(self, may_retrain: bool = True) -> None:
-        """Apply the store's newest corrections to window, references, count of new labels and rule.
+        """Apply the newest corrections (changes of labels) in the store to all that was learned.
 
-        If the model cannot change a reference and `may_retrain` is True, it is retrained in this
-        thread, or, if it is pinned, fitted again as a new version; only the robot cell that
-        corrected does so, and no training may be under way then (`end_training`). If the next
-        training does not start from the model in force, because labels were forgotten, its features
-        are computed in advance (`_precompute_other_start`). The store is checked against its ledger
-        (its hash chain); a difference sets the outbox's `integrity_error`, after which every part
-        is verified. A damaged trace is reported by an event in the store. With no new correction
-        the window is read and the rule rebuilt, too; a baseline (a model that the user handed in)
-        is then retrained all the same. Raises StoreError if the store is unavailable, and what
+        They change the training window (the newest labelled traces), the references (labelled
+        points that new traces are compared with) and the count of new labels, and the decision rule
+        is rebuilt. If the model cannot change a reference and `may_retrain` is True, it is
+        retrained in this thread, or, if it is pinned (kept in force by a rollback), fitted again as
+        a new version; only the robot cell that corrected does so, and no training may be under way
+        then (`end_training`). If the next training does not start from the model in force, because
+        labels were forgotten (withdrawn), its features are computed in advance
+        (`_precompute_other_start`). The store is checked against its ledger (its hash chain); a
+        difference sets the outbox's `integrity_error`, after which every part is verified. A
+        damaged trace is reported by an event (a row in the store's log). With no new correction the
+        window is read and the rule rebuilt, too; a baseline (a model that the user handed in) is
+        then retrained all the same. Raises StoreError if the store is unavailable, and what
         `retrain` raises, or, for a pinned model that is fitted again, `roll_back`.
         """
         self._outbox.check_integrity(0)  # the rule is rebuilt from all of it
@@ -656,12 +675,12 @@ class Learner:
     def _precompute_other_start(self) -> None:
         """Begin to precompute for the next training if it does not start from the model in force.
 
-        This can be so after a label was forgotten: the training then starts from an earlier version
-        or from initial weights. A thread computes what that model needs of the traces in the
-        training window, and keeps it in that model; a failure is logged. Without labels, and while
-        an earlier thread still works, nothing is begun. Without an executor the retrain would wait
-        for the thread, and its report would count these seconds; so this call waits for the thread,
-        also for an earlier one.
+        This can be so after a label was forgotten (withdrawn): the training then starts from an
+        earlier version or from initial weights. A thread computes what that model needs of the
+        traces in the training window (the newest labelled traces), and keeps it in that model; a
+        failure is logged. Without labels, and while an earlier thread still works, nothing is
+        begun. Without an executor the retrain would wait for the thread, and its report would count
+        these seconds; so this call waits for the thread, also for an earlier one.
         """
         if self._choose_start() is self.live.newest:
             return
@@ -672,12 +691,12 @@ class Learner:
             self.wait_until_precomputed()
 
     def release(self, author: str) -> Change:
-        """Let retrains replace a version again that a rollback pinned, and return the stored event.
+        """Let retrains replace the version that a rollback pinned, and return the stored event.
 
-        The same model, with its rule, goes on as a new version, of which `take_report` then returns
-        a report. It is not checked that a version is pinned. If the new version cannot be stored,
-        also because another robot cell of the product stored one meanwhile, StoreError is raised
-        and nothing changes.
+        The event is a row in the store's log. The same model, with its decision rule, goes on as a
+        new version, of which `take_report` then returns a report. It is not checked that a version
+        is pinned. If the new version cannot be stored, also because another robot cell that shares
+        versions with this one stored one meanwhile, StoreError is raised and nothing changes.
         """
         live = self.live
         event = Change(
@@ -694,24 +713,27 @@ class Learner:
     def roll_back(self, number: int, event: Change) -> None:
         """Put the earlier version `number` in force again, as a new version that is pinned.
 
-        No training may be under way (`end_training`). The version is stored together with `event`,
-        and `take_report` then returns a report of it. Until it is stored nothing changes, so all
-        that can fail comes before: checking the store against its ledger (its hash chain), reading
-        the version, restoring it, and adding the later labels, up to the training window's
-        capacity, as its references. A difference from the ledger sets the outbox's
-        `integrity_error`, and a damaged trace is reported by an event in the store. Once it is in
-        force, new labels count from zero, since the version knows all labels until now. A retrain
-        that was requested before is not begun any more. If the next training starts from another
-        model, a thread begins to precompute for it; without an executor this call waits for the
-        thread.
+        Pinned means that no automatic retrain replaces it. No training may be under way
+        (`end_training`). The version is stored together with `event`, and `take_report` then
+        returns a report of it. Until it is stored nothing changes, so all that can fail comes
+        before: checking the store against its ledger (its hash chain), reading the version,
+        restoring it, and adding the later labels, up to the capacity of the training window (the
+        newest labelled traces), as its references (labelled points that new traces are compared
+        with). A difference from the ledger sets the outbox's `integrity_error`, after which every
+        part is verified, and a damaged trace is reported by an event (a row in the store's log).
+        Once it is in force, new labels count from zero, since the version knows all labels until
+        now. A retrain that was requested before is not begun any more. If the next training starts
+        from another model, a thread begins to precompute for it; without an executor this call
+        waits for the thread.
 
         A baseline (a model that the user handed in), which is fitted again, gets the labels as they
-        count now, since it cannot take a label back. An exception as the model takes over the rule
-        in force is logged.
+        count now, since it cannot take a label back. The model takes over the decision rule in
+        force; an exception of this is logged.
 
         Raises StoreError if the version is not kept or is damaged, if a trace is damaged that the
         model must be fitted on again, and if the version cannot be stored, also because another
-        robot cell of the product stored one meanwhile; and what `restore_model` raises.
+        robot cell that shares versions with this one stored one meanwhile; and what `restore_model`
+        raises.
         """
         begin = self._clock()
         self._outbox.check_integrity()
@@ -736,13 +758,14 @@ class Learner:
         """Go on under another policy, as a new version of the same model.
 
         The version is stored with `event`, and `take_report` then returns a report of it. With
-        `policy` the decision rule starts anew and counts the decisions that `evidence` names. With
-        None only settings outside the model have changed, and its rule goes on. Before the first
-        retrain only the event is stored. A failure to make the model with the new rule ready is
-        logged. Raises SettingError if the rule cannot be made, or the recipe of another robot cell
-        of the product cannot be read; StoreError if the event cannot be stored, also because
-        another cell of the product stored a version meanwhile; and what the constructor of a user's
-        rule raises, except TypeError. After each of these errors nothing is changed.
+        `policy` the decision rule (bound to action) starts anew and counts the decisions that
+        `evidence` names. With None only settings outside the model have changed, and its rule goes
+        on. Before the first retrain only the event is stored. A failure to make the model with the
+        new rule ready is logged. Raises SettingError if the rule cannot be made, or the recipe (the
+        settings) of another cell of the product (robot cells that share labels and versions) cannot
+        be read; StoreError if the event cannot be stored, also because another cell of the product
+        stored a version meanwhile; and what the constructor of a user's rule raises, except
+        TypeError. After each of these errors nothing is changed.
         """
         live = self.live
         template = live.template
@@ -763,8 +786,9 @@ class Learner:
         """Store a model as the next version, with the event of a person's change; put it in force.
 
         `take_report` then returns a report of it, accepted, with `reason` and `seconds`; this
-        empties `dropped`. If the version cannot be stored, also because another robot cell of the
-        product stored a version meanwhile, StoreError is raised and nothing changes.
+        empties `dropped`, the list of reasons why retrains were dropped. If the version cannot be
+        stored, also because another robot cell that shares versions with this one stored one
+        meanwhile, StoreError is raised and nothing changes.
         """
         report = RetrainReport(
             self.live.next_version, seconds, len(trained_on.seq), 0, True, reason
