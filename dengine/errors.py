@@ -71,9 +71,10 @@ def as_options(text: str) -> str:
     """Return a message in which Python's arguments are written as options of the command line.
 
     `rate_hz=500` becomes `--rate-hz 500`, and a name alone in parentheses, `(samples)`, becomes
-    `(--samples)`. Only the names in `OPTIONS` are rewritten, and not after a colon.
-    `TraceSpec(...)` around arguments is dropped, with a `DataEngine(trace=...)` around it, also
-    within quotes. A value in quotes loses them unless a shell needs them. A value that begins
+    `(--samples)`. Only the names in `OPTIONS` are rewritten (channel, channels, fit, samples,
+    rate_hz, unit, trigger, alpha, lower_bound, guarantee, stops, audit_rate), and not after a
+    colon. `TraceSpec(...)` around arguments is dropped, with a `DataEngine(trace=...)` around it,
+    also within quotes. A value in quotes loses them unless a shell needs them. A value that begins
     neither with a quote nor with a letter, a digit, `_` or a point, like -1, stays with its name as
     it was. All other text stays, also text in single quotes, which messages use for data, unless a
     letter, a digit, `_` or `=` stands before the quote.
@@ -193,7 +194,7 @@ def expect(
 def instead(
     error: type[DengineError], message: str, *caught: type[Exception], do: str = ""
 ) -> Iterator[None]:
-    """Context manager that raises `error` in place of the exceptions `caught`, which are its cause.
+    """Raise `error` in place of the exceptions `caught`, which become its cause; a context manager.
 
     Parameters
     ----------
@@ -201,8 +202,9 @@ def instead(
         Class of the new error. An exception of this class or a subclass passes unchanged.
     message : str
         Beginning of the new message. The text of the caught exception follows, on one line and cut
-        to 300 characters; if it is empty, the name of its class. Of an OSError that has a
-        `strerror` only this follows. It lacks the file's name, so `message` must name the file.
+        to 300 characters; if it is empty, the name of its class. For an OSError that has a
+        `strerror`, this text alone follows; it lacks the file's name, so `message` must name the
+        file.
     *caught : type
         Exceptions to catch. All others pass unchanged.
     do : str

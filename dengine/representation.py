@@ -10,14 +10,15 @@ from .errors import without_password
 
 
 def to_jsonable(value: Any) -> Any:
-    """Return a value as `json` takes it, with the passwords of database URLs masked.
+    """Return a value in a form that `json` can encode, with the passwords of database URLs masked.
 
     Dataclasses and mappings become dicts with text keys, arrays and tuples become lists, NumPy's
-    numbers Python's, and NaN and infinities None. Any other object, a set or a class for example,
-    becomes the text that `str` gives. All of this is done at any depth; `value` is not changed.
-    Passwords are masked in all texts but keys. A dataclass field whose `metadata` has "apart" is
-    left out (large arrays have it). If it has "flat", the fields of its value stand in its place;
-    a value that is no dataclass or mapping raises TypeError or ValueError.
+    numbers become Python's, and NaN and infinities become None. Any other object, a set or a class
+    for example, becomes the text that `str` gives. All of this is done at any depth; `value` is not
+    changed. Passwords are masked in all texts but keys. A dataclass field whose `metadata` has the
+    key "apart" is left out (large arrays have it). A field with the key "flat" is replaced by the
+    fields of its value, which must be a dataclass or a mapping: another value raises TypeError or
+    ValueError.
     """
     # Floats first: a server's responses consist mostly of them.
     if isinstance(value, float):

@@ -318,15 +318,15 @@ class Description:
 
     @classmethod
     def from_dict(cls, values: Stated, where: str = "description") -> "Description":
-        """Return the description that nested dicts state, like those of a TOML file.
+        """Return the description of recordings that nested dicts state, like those of a TOML file.
 
         Keys that are left out get their default values. Any key but `version` may have the value
-        `?`, but a section may not. A channel named `?` is left out, and so is this name in `[rows]`
-        and `[ignored]`. Of a channel, a text in place of a dict is its unit. A single value may
-        stand for a list of one, and a number or boolean for a text. The result has no `notes`.
-        Raises DataError for an unknown key, such as `notes`, or choice (the message names the most
-        similar key, or else all), for a value of the wrong type, for NaN or infinity in a key of
-        floats, and for a version that is newer or no integer.
+        `?` (not known yet), but a section may not. A channel named `?` is left out, and so is this
+        name in `[rows]` and `[ignored]`. Of a channel, a text in place of a dict is its unit. A
+        single value may stand for a list of one, and a number or boolean for a text. The result has
+        no `notes`. Raises DataError for an unknown key, such as `notes`, or choice (the message
+        names the most similar key, or else all), for a value of the wrong type, for NaN or infinity
+        in a key of floats, and for a version that is newer or no integer.
 
         where : what the description is called in errors.
         """
@@ -381,8 +381,8 @@ class Description:
 
         It has the version, the keys that do not have their default values, and the channels, for
         which `?` stands if there are none. A note on a whole section, like `channels`, is not
-        written; a note on a key that is not there, or within a table of one line, stands first in
-        its section. Notes on `[[check]]` stand in each of its tables.
+        written; a note on a key that is not there, or within a table that stands in one line, comes
+        first in its section. Notes on `[[check]]` stand in each of its tables.
         """
         values = {"version": self.version, **self.to_dict()}
         lines = self._lines("", {k: v for k, v in values.items() if k not in SECTIONS})
@@ -440,13 +440,14 @@ class Description:
     def with_values(self, stated: Stated) -> "Description":
         """Return a description in which the given keys, like `label.column`, have these values.
 
-        Of the keys `column`, `path`, `line`, `topic` and `listing` in `[label]`, stating one clears
-        the others, and likewise of `column`, `path` and `line` in `[part]`; words for good and bad
-        stay. Stating a channel replaces the channel `?`. In `rows.NAME.keep`, `channels.NAME.unit`
-        and keys like these (`OF_COLUMN`) the name of a column may have dots; any other key is split
-        at its first dot. A key without a dot may be a whole section, which its value then replaces.
-        The notes stay. Raises DataError as `from_dict` does, if what stands before the dot in a key
-        is no section, and for a key like `check.column` if there is a `[[check]]` already.
+        The keys `column`, `path`, `line`, `topic` and `listing` in `[label]` each say where the
+        label stands: stating one clears the others, and likewise with `column`, `path` and `line`
+        in `[part]`; words for good and bad stay. Stating a channel replaces the channel `?`. In
+        `rows.NAME.keep`, `channels.NAME.unit` and keys like these (`OF_COLUMN`) the name of a
+        column may have dots; any other key is split at its first dot. A key without a dot may be a
+        whole section, which its value then replaces. The notes stay. Raises DataError for an
+        unknown key or a wrong value, as `from_dict` does, if what stands before the dot in a key is
+        no section, and for a key like `check.column` if there is a `[[check]]` already.
         """
         values = self.to_dict()
         for section in ("label", "part"):
@@ -466,9 +467,10 @@ class Description:
     def with_channels(self, columns: Sequence[str]) -> "Description":
         """Return the description with exactly these columns as channels, in this order.
 
-        Each must be in `[channels]`, whose settings stay, or else in `[ignored]`, which gives its
-        unit. `[ignored]` stays as it is, so such a column is in both then; a channel that is not
-        among `columns` is dropped. Raises DataError for any other column.
+        Channels are the signals that are read. Each column must be in `[channels]`, whose settings
+        stay, or else in `[ignored]`, the columns without a use, which gives its unit. `[ignored]`
+        stays as it is, so such a column is in both then; a channel that is not among `columns` is
+        dropped. Raises DataError for any other column.
         """
         channels = {column: Channel(unit) for column, unit in self.ignored.items()}
         channels |= self.channels

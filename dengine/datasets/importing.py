@@ -52,11 +52,12 @@ RATE_TOLERANCE = 0.02  # relative error of rates that are measured from timestam
 def in_form_of(store: "StoreLike", description: Description) -> Description:
     """Return a description with the trace length of a store, for recordings to be imported into it.
 
-    `traces.samples` becomes the number of samples in the store's `TraceSpec`, and `traces.lengths`
-    its `fit` unless that is "strict". Traces of another length would have other hashes, so those
-    that the store has would be imported again. The description is returned as it is if the store is
-    new, cannot be opened, or has no readable `TraceSpec`. `store` is a path or URL, or an open
-    store, which stays open.
+    The description says how the recordings are read. In the result `traces.samples` is the number
+    of samples in the store's `TraceSpec` (the shape and rate of its traces), and `traces.lengths`,
+    which says what happens to recordings of another length, is its `fit` unless that is "strict".
+    Traces of another length would have other hashes, so those that the store has would be imported
+    again. The description is returned as it is if the store is new, cannot be opened, or has no
+    readable `TraceSpec`. `store` is a path or URL, or an open store, which stays open.
     """
     try:
         with opening(store, must_exist=True) as opened:
@@ -75,10 +76,11 @@ def check_agreement(data: Dataset, trace_spec: TraceSpec) -> None:
     """Raise TraceError if a data set does not agree with `trace_spec`, that of a store.
 
     If both rates are known, they must be the same within 2 % of the higher one; if both have
-    channel names, these must be the same in the same order. Traces that were read by a description
-    (`data.lengths` is set) must have the store's number of samples, and the store and the data set
-    must both have the `fit` "resample", or neither. The number of channels, the units and the range
-    of the sensor (`limit`) are not compared. Raises SettingError if `data.spec` does.
+    channel names, these must be the same in the same order. Traces of recordings, whose original
+    lengths are in `data.lengths`, must have the store's number of samples. For them, too, `fit`
+    (what happens to traces of another length) must be "resample" both in the store and in the data
+    set, or in neither. The number of channels, the units and the range of the sensor (`limit`) are
+    not compared. Raises SettingError if no `TraceSpec` can be made of the data set (`data.spec`).
     """
     spec = data.spec
     is_resampled = {item.fit == "resample" for item in (spec, trace_spec)}
@@ -141,7 +143,7 @@ def import_labelled(
 
     The traces are stored in chunks, each in one transaction: if an import is interrupted, the same
     call continues it. A trace that the store has from an earlier import is not stored again, but a
-    trace that a cell recorded itself is.
+    trace that a robot cell recorded itself is.
 
     Parameters
     ----------
@@ -150,23 +152,25 @@ def import_labelled(
         engine that this call makes on it; but if the engine cannot be made, the store object may be
         closed.
     dataset : object
-        Anything `load_dataset` takes. Recordings that a description describes are brought to the
+        Anything `load_dataset` takes. Recordings that are read by a description are brought to the
         length of the store's traces.
     recipe, seed : optional
-        For the engine of a new store; by default those of another cell of its product, or else
-        recipe conv and seed 0. A used store has its own recipe and seed; other values raise
-        SettingError.
+        Settings (a `Recipe`, a name like "conv", or a TOML file) and random seed of the engine of a
+        new store; by default those of another robot cell in the database that makes the same
+        product, or else recipe conv and seed 0. A used store has its own recipe and seed; other
+        values raise SettingError.
     on_traces : callable, optional
         Called after each chunk with its number of traces, also those that the store had already.
     allow_import : bool
-        Whether classes of the user that a used store names may be imported; if not, such a store
-        raises ImportRefusedError, a SettingError.
+        Whether a user's own classes, like a reducer, that a used store names may be imported; if
+        not, such a store raises ImportRefusedError, a SettingError.
 
     Returns
     -------
     ImportReport
-        How many labels were stored, or quarantined with a faulty trace, and how many the store had
-        already or contradicts.
+        How many labels were stored, or stored with a faulty trace and never used in training
+        (quarantined), how many the store had already, and how many were left out because they
+        contradict a stored label.
 
     Raises
     ------
@@ -177,9 +181,9 @@ def import_labelled(
         If the data set cannot be read, see `load_dataset`; then no store is created.
     SettingError
         If the recipe is wrong, recipe or seed are not those of a used store, or `windows.trigger`
-        of the description is malformed.
+        of the description, the condition at which long recordings are cut, is malformed.
     StoreError
-        If the store cannot be opened or written, or another engine owns its cell; chunks before the
+        If the store cannot be opened or written, or another engine runs on it; chunks before the
         error stay.
     """
     description = None
@@ -217,13 +221,14 @@ def import_parts(
     """Store parts with their decisions and labels, in chunks of 500.
 
     Each chunk is one transaction; if storing one raises StoreError, those before stay. If the store
-    has a label for a decision, also a forgotten one, nothing is changed: the new label is counted
-    as repeated or contradicted. A decision that it has without a label stays as it is, too, and
-    gets only the label. New rows have the time of the import. A trace with a fault is stored but
-    never used in training, and its decision gets the fault as its reason. If `policy.stops` is
-    "some", each label also stores the number of accepted parts without a report since the label
-    before, or since the last change of the policy; the label of a trace with a fault stores 0, and
-    the next label counts these parts.
+    has a label for a decision, also one that was withdrawn, nothing is changed: the new label is
+    counted as repeated or, if it differs, as contradicted. A decision that it has without a label
+    stays as it is, too, and gets only the label. New rows have the time of the import. A trace with
+    a fault (like a NaN, or a value at the limit of the sensor) is stored but never used in
+    training, and its decision gets the fault as its reason. If `policy.stops` is "some" (a missing
+    report on an accepted part says nothing), each label also stores the number of accepted parts
+    without a report since the label before, or since the last change of the policy; the label of a
+    trace with a fault stores 0, and the next label counts these parts.
 
     Parameters
     ----------
@@ -234,16 +239,16 @@ def import_parts(
     trace_spec : TraceSpec
         Shape of the traces, and the range of the sensor, by which faults are found.
     policy : Policy
-        The policy under which the decisions were made. Each stored decision gets its propensity
-        from it; `Decision.propensity` is not read.
+        The policy under which the decisions were made. Each stored decision gets its propensity,
+        the probability of a check, from it; `Decision.propensity` is not read.
     on_traces : callable, optional
         Called with the number of parts of each chunk after it was stored.
 
     Returns
     -------
     ImportReport
-        It counts labels, not parts: those that were stored, quarantined with a faulty trace, known
-        already and contradicted. `resumed` is True, whatever the store was.
+        It counts labels, not parts: those that were stored, stored with a faulty trace
+        (quarantined), known already and contradicted. `resumed` is True, whatever the store was.
 
     Raises
     ------
@@ -308,11 +313,13 @@ def _as_stored(
 ) -> StoredDecision:
     """Return a record of a decision and a copy of its trace (C, T), without storing it.
 
-    Its propensity, the probability of a check, is the policy's audit rate (1 in shadow mode) if the
-    model was certain, else 1. `checked` is what a `TraceGate` returned for the trace: its fault (0
-    if it has none) and its content hash. A fault becomes the reason of the decision, whose
-    propensity stays, and the record is marked as quarantined. `time` is that of the decision,
-    seconds since 1970.
+    Its propensity, the probability of a check, is 1 if the model alone would have checked the part.
+    If the model would have accepted or rejected it, this is the policy's audit rate, the share of
+    such parts that are checked at random, and 1 in shadow mode, in which every part is checked.
+    `checked` is what a `TraceGate` returned for the trace: its fault, a position in `REASONS` (0 if
+    it has none), and its content hash, which the record has if the part has no number; otherwise it
+    has the hash of the number. A fault becomes the reason of the decision, and the record is marked
+    as quarantined (never used in training). `time` is that of the decision, seconds since 1970.
     """
     fault, content = checked
     return StoredDecision(
@@ -331,10 +338,10 @@ def _as_stored(
 def _verifying_decisions(traces: TraceArray, data: Dataset) -> Iterator[Decision]:
     """Yield a VERIFY decision, made without a model, for each of the traces (n, C, T).
 
-    The id of a decision is made of the hash of the trace's content and a counter of equal traces,
-    so that the same data set gives the same ids. The parts' numbers are those of `data`. Raises
-    TraceError for a part's number that is empty, has more than 200 characters, or has characters
-    that do not print; the decisions before it are yielded.
+    VERIFY has the part checked. The id of a decision is made of the hash of the trace's content and
+    a counter of equal traces, so that the same data set gives the same ids. The parts' numbers are
+    `data.part`. Raises TraceError for a part's number that is empty, has more than 200 characters,
+    or has characters that do not print; the decisions before it are yielded.
     """
     n_equal = Counter[int]()
     parts = [None] * len(data) if data.part is None else data.part.tolist()

@@ -32,21 +32,23 @@ def load_dataset(
 ) -> Dataset:
     """Read a data set: one in a format of dengine, or recordings with their description.
 
+    Recordings are files or tables with the samples of parts; a description says how they are read.
+
     Parameters
     ----------
     source : str, path, Dataset, DataFrame or pair (X, y), default "insertion"
-        The name of a bundled set, or recordings that a description describes: a folder, a file or a
-        DataFrame. No description is needed for a `Dataset`; arrays X (n, T) or (n, C, T) and y
-        (n,); an .npz file with X, y of 1 and 0, and perhaps scale, rate_hz, unit, cause (why a part
-        failed), channels and part; a table that `Dataset.to_frame` made, or its Parquet file; the
-        SQLite file of a store, of which the labelled traces of the cell named "cell" and of the
-        other cells of its product are read (a damaged trace is left out, and the store gets an
-        event on it). Such a file or table is read by a description all the same if a description is
-        given, or saved beside the file.
+        The name of a set that comes with dengine, or recordings: a folder, a file or a DataFrame.
+        No description is needed for a `Dataset`; arrays X (n, T) or (n, C, T) and y (n,); an .npz
+        file with X, y of 1 and 0, and perhaps scale, rate_hz, unit, cause (why a part failed),
+        channels and part; a table that `Dataset.to_frame` made, or its Parquet file; the SQLite
+        file of an engine's store, of which the labelled traces of the robot cell named "cell" and
+        of the other cells that make the same product are read (a damaged trace is left out, which
+        is noted in the store's log). Such a file or table is read by a description all the same if
+        a description is given, or saved beside the file.
     description : Description, dict or path, optional
-        How the recordings are written; DataError beside a `Dataset`, a pair or the name of a
-        bundled set. None: the description that was saved, as `recordings.toml` in the folder or
-        `FILE.toml` beside the file.
+        How the recordings are read; DataError beside a `Dataset`, a pair or the name of a set that
+        comes with dengine. None: the description that was saved, as `recordings.toml` in the folder
+        or `FILE.toml` beside the file.
     channels : str or sequence of str, optional
         The channels to read, "FZ_Base" or "FZ_Base,FX_Base", among those that the description or
         the data set names. None: all channels of the data set, or those in `[channels]` of the
@@ -55,24 +57,25 @@ def load_dataset(
         Number of samples of each trace: the rest is cut off at the end. None: as the description
         states, or as the data set is.
     progress : callable, optional
-        Called with 1 after each file that is read by a description; once for a bag or a table.
+        Called with 1 after each file that is read by a description; once for a ROS bag or a table.
 
     Returns
     -------
     Dataset
-        A recording that does not follow the description is one of its `faults`. A lost sample is
-        NaN; the engine verifies such a trace. `spec` is the `TraceSpec` of live traces of this
-        shape.
+        A recording that does not follow the description is left out, and one of its `faults` says
+        why. A cell without a value is a NaN in the trace; an engine has the part of such a trace
+        checked. `spec` is the `TraceSpec` for an engine whose traces have this shape.
 
     Raises
     ------
     DataError
         If the description is missing or has a key whose value is `?` (the message says what to
         type), if the source or a channel does not exist, if no recording is left, if `samples` is
-        below 1, or if the traces are shorter than `samples`, or longer with the `fit` "resample".
-        Also if none of the files can be read, a listing of labels cannot be read, the rows of a
-        store contradict its ledger, or the traces and labels do not fit together (`make_dataset`),
-        like those of a table of `Dataset.to_frame` that was changed.
+        below 1, or if the traces are shorter than `samples`, or longer and resampled (`fit`), since
+        these are not cut. Also if none of the files can be read, a file that lists the labels
+        cannot be read, the rows of a store contradict its ledger (the chain of hashes over them),
+        or the traces and labels do not fit together (`make_dataset`), like those of a table of
+        `Dataset.to_frame` that was changed.
     SettingError
         If `windows.trigger` of the description, which cuts long recordings, is malformed, or if
         `channels` is given for a data set of which `Dataset.spec` cannot be made.
@@ -115,14 +118,16 @@ def description_of(
 ) -> Description:
     """Return a description of recordings: the given one, the saved one, or a proposal.
 
-    Nothing is checked but keys and types (see `check_description`), and nothing is saved.
+    A description says how recordings are read. Nothing in it is checked but keys and types (see
+    `check_description`), and nothing is saved.
 
     Parameters
     ----------
     source : path or DataFrame
         The recordings. They are looked at only if `description` is None.
     description : Description, mapping or path, optional
-        None: the description that was saved in the folder or beside the file.
+        None: the description that was saved, as `recordings.toml` in the folder or `FILE.toml`
+        beside the file.
     stated : mapping, optional
         Values of keys like `label.column`. They replace those in a description file, and a proposal
         keeps them. Not used if `description` is a Description or a mapping.
@@ -137,7 +142,8 @@ def description_of(
         the wrong type, or a description cannot be read or proposed. Without `propose`, too, a
         proposal is made for the message, and its errors come first.
     SettingError
-        If none was saved, and a stated `windows.trigger` is malformed.
+        If none was saved, and a stated `windows.trigger`, the condition at which long recordings
+        are cut, is malformed.
     """
     if isinstance(description, Description):
         return description
@@ -162,8 +168,9 @@ def description_of(
 def missing_text(path: Path, proposal: Description) -> str:
     """Return the error message for recordings at `path` without a description.
 
-    It lists the open keys of the proposed description, whose value is `?`, with the notes on them,
-    and has the commands that show and save the proposal.
+    A description says how recordings are read. The message lists the keys of the proposed one whose
+    value is `?`, so that the user must state it, with the notes on them, and has the commands that
+    show and save the proposal.
     """
     keys = proposal.open_keys
     questions = "".join(f"\n  {key}: {proposal.notes.get(key, '')}" for key in keys)
@@ -179,12 +186,13 @@ def own_reader(source: Any) -> Callable[[], Dataset] | None:
     """Return a function that reads a source in a format of dengine; None if it needs a description.
 
     The formats are a `Dataset`, which the function returns itself, a tuple (X, y), the name of a
-    bundled set, even if a file or folder has this name, a table of `Dataset.to_frame` or its
-    Parquet file, an .npz file with X and labels y of 1 and 0, and a SQLite file, which must be a
-    store. The function takes no arguments and raises the errors of `load_dataset`. A folder needs a
-    description, and so does a file beside which a description was saved, whatever the file holds.
-    Raises DataError for a source of an unknown type, for a path that does not exist, for a file
-    that cannot be opened, for a damaged .npz or Parquet file, for an .npz file whose y holds Python
+    set that comes with dengine, even if a file or folder has this name, a table of
+    `Dataset.to_frame` or its Parquet file, an .npz file with X and labels y of 1 and 0, and a
+    SQLite file, which must be the store of an engine. The function takes no arguments and raises
+    the errors of `load_dataset`. A folder needs a description, which says how its files are read,
+    and so does a file beside which a description was saved, whatever the file holds. Raises
+    DataError for a source of an unknown type, for a path that does not exist, for a file that
+    cannot be opened, for a damaged .npz or Parquet file, for an .npz file whose y holds Python
     objects or needs too much memory, and for a Parquet file without pyarrow.
     """
     if isinstance(source, Dataset):
@@ -285,13 +293,13 @@ def _read_npz(path: Path) -> Dataset:
 
 
 def _read_store(path: Path) -> Dataset:
-    """Return the labelled traces of a store, in the order of their labels, corrections applied.
+    """Return the labelled traces of a store, with corrected labels, in the order of these.
 
-    The labels are those of the cell named "cell" and of the other cells of its product. Quarantined
-    traces and forgotten labels are left out. So is a trace that is missing or not as it was stored,
-    and an event is written to the store, or logged if that fails. If several traces are of one
-    part, `part` is the hash by which the store counts them as one part; otherwise it is None. The
-    store is closed.
+    They are those of the robot cell named "cell" and of the other cells that make the same product.
+    Traces with a fault, which are never used in training, and labels that a person withdrew are
+    left out. So is a trace that is missing or not as it was stored; this is noted in the store's
+    log or, if that fails, by `logging`. If several traces are of one part, `part` is the hash by
+    which the store counts them as one part; otherwise it is None. The store is closed.
 
     Raises DataError if the store has no labelled traces, if its rows contradict its ledger, the
     chain of hashes over them, or if `make_dataset` refuses the traces. Raises StoreError if the

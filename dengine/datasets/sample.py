@@ -14,22 +14,23 @@ BROKEN = 44  # the file that is cut off in its last line; the last, if there are
 
 
 def write_sample(folder: FilePath, n: int = 200) -> None:
-    """Write n insertions of the bundled set as CSV files, such as `insertion_0001_True.csv`.
+    """Write n recordings of the set `insertion` as CSV files, like `insertion_0001_True.csv`.
 
-    The insertions are drawn at random, none twice; the same call always writes the same files. Each
-    file has 960 to 1000 rows at 500 Hz, with the time in Timestamp, the force in FZ_Base, the
-    height in TCP_Z, which is only noise, and the label in its name: True is good. Times are in
-    seconds; file 1 begins at 1012, and each file 12 s after the one before. File 44, or the last
-    one of fewer, lacks its last 16 characters. Numbers have 7 digits; so from file 750 on, at
-    10000 s, times are rounded to 0.01 s and repeat.
+    The set comes with dengine and has the forces of 1503 simulated insertions of a part. They are
+    drawn at random, none twice; the same call always writes the same files. Each file has 960 to
+    1000 rows at 500 Hz, with the time in Timestamp, the force in FZ_Base, the height in TCP_Z,
+    which is only noise, and the label in its name: True is good. Times are in seconds; file 1
+    begins at 1012, and each file 12 s after the one before. File 44, or the last one of fewer,
+    lacks its last 16 characters. Numbers have 7 digits; so from file 750 on, at 10000 s, times are
+    rounded to 0.01 s and repeat.
 
     Parameters
     ----------
     folder : path
         A new or an empty folder.
     n : int, default 200
-        Number of files, 0 or more, which is not checked. The set has 1503 insertions; a greater n
-        writes 1503 files.
+        Number of files, 0 or more, which is not checked. With more than 1503, 1503 files are
+        written.
 
     Raises
     ------

@@ -116,11 +116,11 @@ class Table:
     def numbers(self, name: str, form: TextForm) -> Floats:
         """Return a column as numbers, float64 (rows,) or (1,); a missing number is NaN.
 
-        `form` is the section `[text]` of the description, with the decimal mark, the mark of
-        thousands and the words for a missing number; a column of numbers does not need it. Raises
-        UnreadableError if there is no such column, and for a cell that is no number of this form,
-        is infinite, or is too large for float32. An empty cell or None is such a cell, unless "" is
-        among the words for a missing number.
+        `form` says how numbers are written, with the decimal mark, the mark of thousands and the
+        words for a missing number; a column of numbers does not need it. Raises UnreadableError if
+        there is no such column, and for a cell that is no number of this form, is infinite, or is
+        too large for float32. An empty cell or None is such a cell, unless "" is among the words
+        for a missing number.
         """
         cells = self.column(name)
         if cells.dtype.kind not in "iuf":
@@ -138,7 +138,8 @@ class Table:
 
         is_bad : bool, one for each cell of the column. wanted : what was expected, for the message.
         name : the column whose cell the message shows. The error has the line, 0 if it is unknown,
-        and the column: the file's column of this cell if `origin` has it, else `name`.
+        and the column: `name`, or the file's column of this cell if the column was put together
+        from several (`origin`).
         """
         if is_bad.any():
             row = int(is_bad.argmax())

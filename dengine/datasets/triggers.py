@@ -97,14 +97,15 @@ EXAMPLES = (
 def as_trigger(value: Any) -> Trigger:
     """Return a trigger as it is, or make one from a text, KIND[=NUMBER][@SIGNAL].
 
-    "bit=0": digital output 0 is on. "register@NAME": the signal NAME is not zero;
-    "register=1@NAME": it is 1. "contact=5": the force FZ_Base is 5 N or more, in either direction.
-    "motion=0.002": the tool moves faster than 2 mm a second. Only bit and contact need a number;
-    without it, register means any value but zero and motion 0.002. A bit is 0 to 31, a register's
-    number any integer; a force and a speed are decimals above 0, without an exponent. They are
-    compared with the signal as it was recorded: no unit is converted. Without @SIGNAL the signal is
-    that of the kind in `KINDS`, and the trigger's `quiet_s` always is. Raises SettingError for any
-    other value.
+    A trigger is a condition on a signal; when it is met, an insertion begins. "bit=0": digital
+    output 0 is on. "register@NAME": the signal NAME is not zero; "register=1@NAME": it is 1.
+    "contact=5": the force FZ_Base is 5 N or more, in either direction. "motion=0.002": the tool
+    moves faster than 2 mm a second. Only bit and contact need a number; without it, register means
+    any value but zero and motion 0.002. A bit is 0 to 31, a register's number any integer; a force
+    and a speed are decimals above 0, without an exponent. They are compared with the signal as it
+    was recorded: no unit is converted. Without @SIGNAL the signal is that of the kind in `KINDS`.
+    The trigger's `quiet_s`, the seconds for which the condition must not have been met before, is
+    always that of the kind. Raises SettingError for any other value.
     """
     if isinstance(value, Trigger):
         return value
@@ -153,10 +154,10 @@ class StartFinder:
     def feed(self, time: float, active: bool) -> Start | None:
         """Take the next sample; return where an insertion begins if the sample shows it, else None.
 
-        It begins if the trigger is on at this sample (`active`), was off at the sample before, and
-        the first sample of this stretch of off is `quiet_s`, less half a step, or more ago. A
-        trigger that is on at the first sample gives no start until it was off. `time` is in seconds
-        and increases.
+        It begins if the trigger, a condition on a signal, is on at this sample (`active`), was off
+        at the sample before, and the first sample of this stretch of off is `quiet_s`, less half a
+        step, or more ago. A trigger that is on at the first sample gives no start until it was off.
+        `time` is in seconds and increases.
 
         If the sample before came 1.5 steps (`step`, the seconds between samples) ago or more,
         samples are missing; the insertion may have begun in this gap, and `seen` of the result is

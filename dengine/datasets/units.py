@@ -56,9 +56,9 @@ def conversion(unit: str, wanted: str) -> float | None:
 def unit_in(name: str) -> str:
     """Return the unit at the end of a column's name, as in `Kraft [N]` or `F_kN`; "" if none.
 
-    It must be a unit of this table, in brackets, or behind `in`, `/`, `_` or `..`, and is returned
-    without them; a point or `_` behind it (`Force..N.`, `Force_N_`) is left out. Behind `/` or `_`
-    a single character is none, except N: `Fz_W` is a force in world axes.
+    It must be a unit in `units.toml`, in brackets, or behind `in`, `/`, `_` or `..`, and is
+    returned without them; a point or `_` behind it (`Force..N.`, `Force_N_`) is left out. Behind
+    `/` or `_` a single character is none, except N: `Fz_W` is a force in world axes.
     """
     match = re.search(
         r"(?:[\[({<]|\bin |\.\.|[/_](?![^N]$))\s*([^\[\](){}<>/_ ]+?)\s*[\])}>_.]?$", name

@@ -81,7 +81,8 @@ def log_evidence(n: int, n_bad: int, tolerance: float, propensity: float = 1.0) 
 def failure_bound(n: int, n_bad: int, alpha: float, propensity: float = 1.0) -> float:
     """Bound the mean failure probability of n parts from above.
 
-    The bound holds at all moments together with probability 1 - alpha.
+    It may be computed again after every part: with probability 1 - alpha all these bounds hold.
+    Whether an outcome is asked for must not depend on how the part is.
 
     Parameters
     ----------
@@ -98,9 +99,10 @@ def failure_bound(n: int, n_bad: int, alpha: float, propensity: float = 1.0) -> 
     Returns
     -------
     float
-        The largest tolerance that the evidence does not refute, found by bisection and rounded up.
-        It lies between n_bad / (n propensity), if that is below 1, and 1. It is 1 if the evidence
-        is too little to refute any tolerance, as for n = 0 or propensity = 0.
+        The largest mean failure probability that the evidence (`log_evidence`) does not refute,
+        found by bisection and rounded up. It lies between n_bad / (n propensity), if that is below
+        1, and 1. It is 1 if the evidence is too little to refute any, as for n = 0 or
+        propensity = 0.
 
     Raises
     ------
@@ -299,10 +301,10 @@ class Certificate:
         It is check * n_unchecked - escape * min(n_unchecked, n * upper), where `check` and `escape`
         are the prices of a check and of a bad part that is accepted, and the other names are
         attributes of `accepted`: the parts without a check, all parts that the bound is about
-        (audited parts are among them if it comes from audits), and the bound on their mean failure
-        probability. An audited part saves no check, and it cannot escape. The result bounds the
-        expected saving. It may be negative: then not checking may have cost money. None without
-        prices.
+        (audited parts are among them if it comes from audits, checks at random of parts that the
+        model would accept), and the bound on their mean failure probability. An audited part saves
+        no check, and it cannot escape. The result bounds the expected saving. It may be negative:
+        then not checking may have cost money. None without prices.
         """
         if self.prices is None:
             return None
@@ -329,12 +331,13 @@ class Certificate:
     def sentence(self) -> str:
         """The claim about accepted parts in English: "Of 1,203 parts ..., at most 3.5 % were bad".
 
-        It names the confidence and the tolerance (with prices, the share of bad parts up to which
-        accepting pays). If nothing can be claimed, it says so, and why. If the certificate has
-        prices, it also says what the checks that were left out would have cost, what bad parts cost
-        at most, rounded up to a whole number, and the difference, rounded down: what was saved at
-        least or, if it is not above 0, lost at most. These costs are missing if the bound is 1 or
-        all parts were checked. With prices the last sentence says when accepting pauses.
+        It names the confidence and the tolerance, the share of accepted parts that may be bad (if
+        the policy decides by prices, the share up to which accepting pays). If nothing can be
+        claimed, it says so, and why. With prices it also says what the checks that were left out
+        would have cost, what bad parts cost at most, rounded up to a whole number, and the
+        difference, rounded down: what was saved at least or, if it is not above 0, lost at most.
+        These costs are missing if the bound is 1 or all parts were checked. With prices the last
+        sentence says when accepting pauses.
         """
         claim = self._claim(
             self.accepted,
@@ -366,7 +369,7 @@ class Certificate:
 
     @property
     def sentence_on_rejects(self) -> str:
-        """The claim about rejected parts as one sentence.
+        """The claim about rejected parts as one sentence: how many of them were good at most.
 
         If nothing can be claimed, it says so, and why.
         """
@@ -381,14 +384,17 @@ class Certificate:
     def _claim(self, group: OutcomeBound, which: str, verb: str, wrong: str, unknown: str) -> str:
         """Return the claim about a group of parts as one sentence.
 
-        It gives the number of parts, the bound in per cent, rounded up, the confidence, and the
-        tolerance or, with prices, the share up to which the decision pays. If the group is empty,
-        its `propensity` is 0 or the bound is 1, the sentence says instead that nothing can be said,
-        and why. For a propensity of 0 the reason is `unknown`, and for accepts nothing can be said
-        "beyond the known stops". `which` describes the parts. With audits the sentence says in its
-        place that the model would `verb` ("accept", "reject") these parts and how many of them were
-        audited, or, if the group is `shadowed`, that each was checked. `wrong` is "bad" or "good",
-        what a wrongly decided part was.
+        It gives the number of parts, the bound on the share decided wrongly, in per cent and
+        rounded up, the confidence, and the tolerance or, if the policy decides by prices, the share
+        up to which the decision pays. If the group is empty, if no outcome was asked for
+        (`propensity` is 0) or if the bound is 1, the sentence says instead that nothing can be
+        said, and why. If no outcome was asked for, the reason is `unknown`, and for accepts nothing
+        can be said "beyond the known stops", the bad parts that stopped the line. `which` describes
+        the parts. If the bound comes from audits (checks at random of parts that the model would
+        decide without a check), the sentence says in its place that the model would `verb`
+        ("accept", "reject") these parts and how many of them were audited, or, if the group is
+        `shadowed`, that each was checked. `wrong` is "bad" or "good", what a wrongly decided part
+        was.
         """
         parts = counted(group.n, "part")
         but = " beyond the known stops" if verb == "accept" else ""
@@ -431,10 +437,14 @@ def certify(
 ) -> Certificate:
     """Bound how often accepted parts were bad and rejected parts good, in all certain decisions.
 
+    A decision is certain if the model would accept or reject the part without a check. Audits are
+    checks of such parts at random.
+
     Parameters
     ----------
     outcomes : Outcomes
-        If `stops` is "all", accepted parts whose outcome is still open must be left out of it.
+        Counts of the parts. If `stops` is "all", accepted parts whose outcome is still open must be
+        left out of it.
     alpha : float
         Error level.
     tolerance : float
@@ -442,13 +452,13 @@ def certify(
     stops : {"all", "some"}
         As in `Policy`: whether every bad accepted part stops the line and becomes known.
     audit_rate : float
-        Probability with which a certain decision is verified all the same; if it changed, the
-        smallest value.
+        Probability with which a part is checked although the decision is certain; if it changed,
+        the smallest value.
 
     Returns
     -------
     Certificate
-        Without prices; its tolerance is rounded to 12 decimals.
+        The two bounds, without prices; its tolerance is rounded to 12 decimals.
 
     Raises
     ------
@@ -459,15 +469,16 @@ def certify(
 
     Notes
     -----
-    If `stops` is "all", or if there are accepted parts and each was confirmed, stopped the line or
-    had its label forgotten, all outcomes are known, and the bound is about the accepted parts.
-    Otherwise it comes from audits and is about all parts that the model would have accepted, those
-    that were audited included; it is never below the share known to be bad. Without audits it is 1.
-    With audits and `stops` "some", the bound may come from known outcomes now and from audits
-    later. The two then share alpha, a tenth for known outcomes and nine tenths for audits: whoever
-    sees both is wrong with probability alpha at most. The bound on rejected parts comes from
-    audits, and without these it is 1; it is never below the share known to be good. A forgotten or
-    overdue label counts as a wrong decision.
+    If `stops` is "all", or if there are accepted parts and each was confirmed as good, stopped the
+    line or had its label withdrawn (forgotten), all outcomes are known, and the bound is about the
+    accepted parts. Otherwise it comes from audits and is about all parts that the model would have
+    accepted, those that were audited included; it is never below the share known to be bad. Without
+    audits it is 1. With audits and `stops` "some", the bound may come from known outcomes now and
+    from audits later. The two then share alpha, a tenth for known outcomes and nine tenths for
+    audits: whoever sees both is wrong with probability alpha at most. The bound on rejected parts
+    comes from audits, and without these it is 1; it is never below the share known to be good. An
+    audit without a report in time (overdue), and a label that was withdrawn, count as wrong
+    decisions.
     """
     lost_accepts = outcomes.forgotten_audited_accepts + outcomes.overdue_audited_accepts
     lost_rejects = outcomes.forgotten_audited_rejects + outcomes.overdue_audited_rejects
@@ -508,12 +519,13 @@ def _bound_audits(
 ) -> OutcomeBound:
     """Return the bound on wrong decisions that rests on audits, and the counts that it is about.
 
-    It is about `n_unchecked` parts that were decided without a check and `n_audited` audited ones,
+    Audits are checks at random of parts that the model would decide without a check. The bound is
+    about `n_unchecked` parts that were decided without a check and `n_audited` audited ones,
     together; `alpha` is its error level. `n_bad` of the audited parts, and `n_others` of the
     unchecked ones, are known to be decided wrongly: the bound is never below the share of both.
-    `audit_rate` is the probability with which a certain decision is audited. In the result `n_bad`
-    counts audited parts alone, and `shadowed` is True if `audit_rate` is 1 and no part went
-    unchecked. Raises the errors of `failure_bound`.
+    `audit_rate` is the probability with which such a part is audited. In the result `n_bad` counts
+    audited parts alone, and `shadowed` is True if `audit_rate` is 1 and no part went unchecked.
+    Raises the errors of `failure_bound`.
     """
     n = n_unchecked + n_audited
     bound = _bound_outcomes(n, n_audited, n_bad, n_unchecked, audit_rate, alpha)

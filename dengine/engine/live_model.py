@@ -109,20 +109,30 @@ class LiveModel:
     ) -> None:
         """Restore a stored version and learn the outcomes that came after it.
 
-        A model like umap-learn, of which not the fit but only the numbers of its traces are stored,
-        is trained on these traces again; any other is restored bit for bit, with its reference
-        points. Without a version, or if one of those traces is damaged or missing, no model is in
-        force, and the rule of the untrained model is updated with the stored outcomes since it
-        began. The outcomes that update the rule, and the labels of such a training, are checked
-        against the store's ledger; a difference sets the outbox's `integrity_error`, after which
-        every part is verified. A damaged trace is reported by an event in the store. Labels that
-        came after the version was stored become references, in a product only the labels of this
-        robot cell, and corrections since then are applied (`add_labels_since`). If the version is
-        from before the present rule, its stored rule is not taken. If the stored rule does not
-        include what it must (`RuleProgress.last_seq`), the rule is rebuilt from all outcomes. An
-        exception as the model is made ready, or as the rule or the references learn, is logged; an
-        exception of the rule also makes it stale, so that every part is verified. `overdue`,
-        `overdue_to` and `corrected_to` are restored, too.
+        A version is a trained model with its references (embedded labelled traces, which it counts
+        near a new trace) and its decision rule, which turns the bounds of a success probability
+        into an action and is updated with the outcomes of parts. The restored version decides from
+        now on: it is in force. A model like umap-learn, of which not the fit but only the numbers
+        of its traces are stored, is trained on these traces again; any other is restored bit for
+        bit. Without a version, or if one of those traces is damaged or missing, no model is in
+        force, and the rule of the untrained model is updated with the stored outcomes since the
+        rule began.
+
+        Labels that came after the version was stored become references; in a product (several robot
+        cells that share labels) only the labels of this cell do. Corrections since then, which
+        change or withdraw a label, are applied (`add_labels_since`). The rule is updated with the
+        outcomes that it lacks. It is rebuilt from all outcomes if the stored rule cannot be
+        continued (`RuleProgress.last_seq` is 0), for example because a label was corrected, a check
+        is overdue (not reported within `label_within` decisions), or the version is from before the
+        present rule, which a change of the policy began.
+
+        The outcomes that update the rule, and the labels of a repeated training, are checked
+        against the store's ledger (its hash chain). A difference sets `outbox.integrity_error`,
+        after which every part is verified. A damaged trace is noted as an event in the store's log.
+        An exception as the model is made ready, or as the rule or the references learn, is logged;
+        after an exception of the rule every part is verified, too. The attributes `overdue` and
+        `overdue_to` (which checks are overdue) and `corrected_to` (the newest correction that was
+        applied) are restored.
 
         Parameters
         ----------
@@ -133,7 +143,7 @@ class LiveModel:
         label_within : int
             After how many later decisions a check without a report is overdue.
         policy_since : int
-            First version under the policy in force.
+            Number of the first version under the present policy.
 
         Raises
         ------
@@ -182,11 +192,11 @@ class LiveModel:
     def swap_in(self, model: EngineModel, version: int, trained_on: TrainedOn) -> None:
         """Put a model in force, as the version of this number; nothing is stored.
 
-        `trained_on` names the labels of its training. The attributes `answering` (the model in
-        force), `version`, `newest_version` (unless it is larger already), `trained_on` and
-        `lacks_steps` (whether its training made some of its optimiser steps, and not all) are set.
-        The caller hands the rule in force over to the model (`EngineModel.prepare`), before or
-        after.
+        In force means that it decides from now on. `trained_on` names the labels of its training.
+        The attributes `answering` (the model in force), `version`, `newest_version` (unless it is
+        larger already), `trained_on` and `lacks_steps` (whether the training made some of its
+        optimiser steps, and not all) are set. The caller must hand the present decision rule over
+        to the model (`EngineModel.prepare`), before or after this call.
         """
         self.answering = model
         self.version = version
@@ -200,14 +210,17 @@ class LiveModel:
     ) -> Point | None:
         """Update the rule with an outcome, and make the trace a reference of the model in force.
 
-        An exception of the rule or the model is logged; if the rule raised, it is stale, and every
-        part is verified. `number` is that of the label. `n_unreported` is the number of accepted
-        parts without an outcome since the previous update. If it is None, or the decision is from
-        before the present rule began, the rule is not updated.
+        The decision rule turns the bounds of a success probability into an action. A reference is
+        an embedded labelled trace, which the model in force (the model that decides now) counts
+        near a new trace. `stored` is the decision with its trace, `success` the label (True: good),
+        and `number` the label's number. `n_unreported` is the number of accepted parts without an
+        outcome since the previous update. If it is None, or the decision is from before the present
+        rule began (for example by a change of the policy), the rule is not updated. An exception of
+        the rule or the model is logged; if the rule raised, it is stale, and every part is verified
+        from then on. A baseline (a model that the user handed in) learns the trace in its own way.
 
         Returns the reference point, float32 of shape (d,), to be stored with the label; None if
-        there is none: before the first retrain, after a failure, and for a baseline (a model that
-        the user handed in).
+        there is none: before the first retrain, after a failure, and for a baseline.
         """
         decision = stored.decision
         if n_unreported is not None and decision.model_version >= self.evidence.since:
@@ -238,12 +251,15 @@ class LiveModel:
         return point if model.keeps_references else None
 
     def count_overdue(self, decision: Decision) -> None:
-        """Update the rule as if a decision was wrong, because its check is overdue.
+        """Update the decision rule as if a decision was wrong, because its check is overdue.
 
-        The decision's id is kept in `overdue`. A failed update is logged, and the rule is stale
-        then. A decision with lower > 0 and upper < 1 updates it twice, as a failure and as a
-        success (`overdue_outcomes`). A decision with the bound (0, 1), which says nothing, or from
-        before the present rule began, changes nothing.
+        A check is overdue if it was not reported within a number of later decisions, which the
+        caller counts. If `lower`, the lower bound of the decision's success probability, is above
+        0, the rule learns a failure; if `upper` is below 1, it learns a success; if both hold, it
+        learns both (`overdue_outcomes`). The decision's id is then put into the set `overdue`. A
+        failed update is logged, and the rule is stale then: every part is verified. A decision with
+        the bounds 0 and 1, which say nothing, or from before the present rule began (for example by
+        a change of the policy), changes nothing.
         """
         if decision.model_version < self.evidence.since:  # of an earlier policy, as in `learn`
             return
@@ -269,13 +285,16 @@ class LiveModel:
     def rebuild_rule(self) -> None:
         """Reset the rule, and update it with the stored outcomes of decisions since it began.
 
-        They are those of `LabelTable.outcomes_since`: this cell's labels as corrected, without
-        forgotten ones, those of quarantined traces and those of inspected rejected parts; overdue
-        checks are among them, as wrong decisions. Labels that are not in the store yet are not, so
-        the rule loses them: store them before. It is the rule of the model in force, or of the
-        untrained model before the first retrain. It begins in the safe mode `began_in` of the
-        attribute `evidence`, the `EvidenceWindow`, which also says since which version decisions
-        count. A rule that never learns is only reset.
+        The decision rule, which turns the bounds of a success probability into an action, is that
+        of the model in force (the model that decides now), or of the untrained model before the
+        first retrain. The outcomes are this cell's labels with their corrections
+        (`LabelTable.outcomes_since`). Left out are labels that were withdrawn, labels of traces
+        with a fault, and labels of rejected parts that somebody inspected. A check that is overdue
+        (not reported in time) counts as a wrong decision. Labels that are not in the store yet are
+        lost to the rule: store them before. The attribute `evidence` says since which model version
+        decisions count (`since`), and in which safe mode the rule begins (`began_in`); in a safe
+        mode every part is verified after an alarm, until new outcomes allow decisions. A rule that
+        never learns is only reset.
 
         An update that fails here is logged and makes the rule stale: every part is then verified
         until the engine is opened again. A rule that was stale before stays so. The store's ledger
@@ -309,12 +328,13 @@ class LiveModel:
     def _read_outcomes(self, after: int) -> list[OutcomeRecord]:
         """Return the stored outcomes of labels after this number, checked against the ledger.
 
-        They are this cell's, of decisions since the present rule began (`LabelTable.outcomes_since`
-        says which labels do not count). The ledger is the store's hash chain. A failed check sets
-        the outbox's `integrity_error`, after which every part is verified; the outcomes are
-        returned all the same. All overdue checks are among them, whatever `after` is. For a rule
-        that never learns nothing is read or checked, and the list is empty. Raises StoreError if
-        the store cannot be read.
+        They are this cell's, of decisions since the present decision rule began, for example by a
+        change of the policy (`LabelTable.outcomes_since` says which labels do not count). All
+        overdue checks (not reported in time) are among them, as wrong decisions, whatever `after`
+        is. The ledger is the store's hash chain. If the labels do not fit it,
+        `outbox.integrity_error` is set, after which every part is verified; the outcomes are
+        returned all the same. For a rule that never learns nothing is read or checked, and the list
+        is empty. Raises StoreError if the store cannot be read.
         """
         if not self.newest.rule_learns:
             return []
@@ -324,15 +344,20 @@ class LiveModel:
     def apply_corrections(self, corrections: Sequence[Correction]) -> bool:
         """Apply the store's newest corrections to the references of the model in force.
 
-        `corrections` must be all after `corrected_to`, in their order. Returns False if the model
-        must be trained again: always for a baseline (a model that the user handed in), and if it
-        cannot change a reference; the other references are changed all the same. The caller must
-        retrain then, because each correction is applied only once. Returns True before the first
-        retrain. An error of the model as it takes a reference again is logged, and the result does
-        not tell of it. `corrected_to` is set to the number of the last correction that was applied,
-        also if this raises; without any it stays. A damaged trace is reported by an event in the
-        store. The rule is left to `rebuild_rule`. Raises StoreError if the store is unavailable;
-        the corrections before the one that failed stay applied.
+        References are the embedded labelled traces that the model in force (the model that decides
+        now) counts near a new trace; a correction changes or withdraws a label. `corrections` must
+        be all with a number above the attribute `corrected_to`, in their order. `corrected_to` is
+        set to the number of the last correction that was applied, also if this raises; without any
+        it stays. The decision rule, which learned from the labels, too, is not changed here, but by
+        `rebuild_rule`.
+
+        Returns True if every correction was applied, and before the first retrain. Returns False if
+        the model must be trained again: always for a baseline (a model that the user handed in),
+        and if the model cannot change a reference; the other references are changed all the same.
+        The caller must retrain then, because each correction is applied only once. An error of the
+        model as it takes a reference again is logged, and the result does not tell of it. A damaged
+        trace is noted as an event in the store's log. Raises StoreError if the store is
+        unavailable; the corrections before the one that failed stay applied.
         """
         store = self.outbox.store
         is_done = self.newest.keeps_references or self.answering is None
@@ -347,11 +372,15 @@ class LiveModel:
     ) -> tuple[EngineModel, EngineModel | None]:
         """Return copies of the untrained model and the model in force, under another policy.
 
-        Their rule is one object, that of the policy, and has learned nothing; it starts in the safe
-        mode that `evidence` names. The second copy is None before the first retrain; it shares the
-        references of the model in force. A baseline, which has no such rule, is returned itself. If
-        the second cannot be made ready to predict, that is logged. Neither is put in force. Raises
-        what `Policy.rule` raises, such as SettingError if the rule cannot be made.
+        A policy has the settings of the decision rule, which turns the bounds of a success
+        probability into an action. The two copies have one rule, made by `policy`, which has
+        learned nothing. It starts in the safe mode `evidence.began_in`: 0 is none; in any other
+        every part is verified until new outcomes allow decisions. The second copy is None before
+        the first retrain; it shares the references (the embedded labelled traces) of the model in
+        force, which decides now. If it cannot be made ready to predict, that is logged. A baseline
+        (a model that the user handed in), which has no such rule, is returned itself. Neither copy
+        is put in force. Raises what `Policy.rule` raises, such as SettingError if the rule cannot
+        be made.
         """
         template = self.template.with_policy(policy)
         template.reset_rule(evidence.began_in)
@@ -373,11 +402,13 @@ class LiveModel:
     def get_state(self, model: EngineModel, trained_on: TrainedOn) -> State:
         """Return the arrays by name with which the store can restore a model as a version.
 
-        They hold the model with its rule (in place of a stale rule `rule_is_stale`; of a baseline
-        nothing), all fields of `trained_on` (such as its labels, and `pinned`), and the numbers
-        of the newest correction that counts and of the newest decision that was examined for an
-        overdue check. If an overdue check counts, they say so (`includes_overdue`): an engine that
-        opens the store then does not take the stored rule, but rebuilds it. Some arrays are views.
+        They hold the model with its references and its decision rule (of a baseline, a model that
+        the user handed in, nothing), all fields of `trained_on` (which labels it was trained on),
+        the number of the newest correction of a label that is applied, and the number of the newest
+        decision that was examined for an overdue check (not reported in time). If the rule is
+        stale, because it missed an update, the array `rule_is_stale` takes its place. If an overdue
+        check counts, there is the array `includes_overdue`: an engine that opens the store then
+        rebuilds the rule, and does not take the stored one. Some arrays are views.
         """
         state = model.get_state() | trained_on.to_state()
         state["corrected_to"] = np.array(self.corrected_to)

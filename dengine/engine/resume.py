@@ -37,18 +37,19 @@ def restore_model(
     """Return a new model in the state of a stored version, made from the untrained `template`.
 
     A model whose fit is not stored, but only the numbers of its traces, like umap-learn or a
-    baseline, is trained again: on the traces of `trained_on`, with the labels as they were after
-    the correction that `trained_on` names. The labels are first compared with the ledger, the
-    store's hash chain. A difference sets the outbox's `integrity_error`, after which every part is
-    verified, and the model is trained nevertheless. A trace whose label was forgotten by then is
-    left out, and does not count as missing. The new model and the template share one rule, so with
-    `with_rule` the template gets the stored rule, too, if the version holds one.
+    baseline (a model that the user handed in), is trained again on the traces of `trained_on`.
+    Their labels are taken as they were after the correction `trained_on.corrected_to`; a correction
+    changes or withdraws a label. A trace whose label was withdrawn by then is left out, and does
+    not count as missing. The labels are first compared with the ledger, the store's hash chain. A
+    difference sets `outbox.integrity_error`, after which every part is verified, and the model is
+    trained nevertheless. The new model and the template share one decision rule object. It stays as
+    it is, but with `with_rule` it gets the stored state, if the version holds one.
 
-    Raises ChangedTracesError if one of these traces is missing or damaged; an event is written to
-    the store that names the damaged ones. Raises StoreError, KeyError, ValueError or
-    NotImplementedError for a state that cannot be restored, like that of another reducer;
-    StoreError for a label that is neither 0 nor 1, for traces of different shapes, and if the store
-    does not answer; and what the training raises.
+    Raises ChangedTracesError if one of these traces is missing or damaged; an event in the store's
+    log names the damaged ones. Raises StoreError, KeyError, ValueError or NotImplementedError for a
+    state that cannot be restored, like that of another reducer; StoreError for a label that is
+    neither 0 nor 1, for traces of different shapes, and if the store does not answer; and what the
+    training raises.
     """
     state = version.state if with_rule else without_rule(version.state)
     model = template.successor()
@@ -81,13 +82,14 @@ def find_clean_start(
 ) -> tuple[EngineModel, str]:
     """Return a model for the next training to start from, which saw no label that is forgotten now.
 
-    If `newest`, whose weights learned from the labels that `trained_on` names, saw no such label,
-    it is returned. It is also returned if it begins anew with each training, like a baseline, or a
-    model that must be fitted again after loading, as its versions lack the fit. Otherwise the
-    newest stored version of the robot cell or its product that saw no such label is returned, as a
-    new model with the rule of `template`; versions that are damaged or not kept, or whose loading
-    or restoring raises StoreError for another reason, are passed over. If there is none, it is
-    `template`, the untrained model with its initial weights.
+    A label is forgotten if a person withdrew it. If `newest`, whose weights learned from the labels
+    that `trained_on` names, saw no such label, it is returned. It is also returned if each training
+    of it begins anew, as of a baseline (a model that the user handed in), or of a model that must
+    be fitted again after loading, since its versions lack the fit. Otherwise the newest stored
+    version that saw no such label is returned, as a new model with the decision rule of `template`;
+    the version may also be of another robot cell with which this cell shares labels. Versions that
+    are damaged or not kept, or whose loading or restoring raises StoreError for another reason, are
+    passed over. If there is none, it is `template`, the untrained model with its initial weights.
 
     Returns
     -------
@@ -142,19 +144,24 @@ def add_labels_since(
 ) -> int:
     """Add the labels since a version, as references, to its restored model, if it lacks them.
 
-    Let N be the number of the newest label that the version was trained on, or that it got with a
-    rollback. The labels are those after N; a baseline (a model that the user handed in) gets those
-    after the newest label that it was trained on. Up to number `shared_to` they are those of all
-    robot cells of the product, and after it only this cell's own. None stands for N, so that an
-    engine that opens a store counts what it counted before. At most the `capacity` newest of the
-    shared labels are read, and as many of the cell's own. Corrections that came since the version
-    was stored are applied between the labels, in the order in which they came, so that the model is
-    the same bit for bit. A correction that the model cannot take (`apply_correction` returns False)
-    is skipped without a message. A baseline, which cannot be corrected, gets the labels as they
-    count now. A label that the model cannot take is logged and skipped; one whose trace is damaged
-    is skipped, and an event is written to the store. Returns the number of the newest correction in
-    the store. Raises StoreError if the store cannot be read, for a label that is neither 0 nor 1,
-    and for traces of different shapes.
+    References are embedded labelled traces, which a model counts near a new trace. Let N be the
+    number of the newest label that the version was trained on, or that was stored when a rollback
+    put the version in force again. The labels are those after N; a baseline (a model that the user
+    handed in) gets those after the newest label that it was trained on. Up to number `shared_to`
+    they are those of all robot cells of the product (cells that share labels), and after it only
+    this cell's own. None stands for N, so that an engine that opens a store counts what it counted
+    before. At most the `capacity` newest of the shared labels are read, and as many of the cell's
+    own.
+
+    Corrections since the version was stored, which change or withdraw a label, are applied between
+    the labels, in the order in which they came, so that the model is the same bit for bit. A
+    correction that the model cannot take (`apply_correction` returns False) is skipped without a
+    message. A baseline, which cannot be corrected, gets the labels as they count now. A label that
+    the model cannot take is logged and skipped; one whose trace is damaged is skipped, and noted as
+    an event in the store's log.
+
+    Returns the number of the newest correction in the store. Raises StoreError if the store cannot
+    be read, for a label that is neither 0 nor 1, and for traces of different shapes.
     """
     corrected_to = int(version.state.get("corrected_to", 0))
     # A baseline cannot be corrected afterwards, so it gets each label as it counts now; another
@@ -193,18 +200,21 @@ def add_labels_since(
 def apply_correction(model: EngineModel, store: SqlStore, correction: Correction) -> bool:
     """Change the reference of a corrected label: relabel it, remove it or add it again.
 
-    If the model cannot take a reference that is added again, the error is logged, and the next
-    version learns the label from the store. If the trace is damaged, an event is written to the
-    store.
+    A reference is an embedded labelled trace, which the model counts near a new trace. It is
+    removed if the label was withdrawn, and added again if a withdrawn label is to count again. If
+    the model cannot take a reference that is added again, the error is logged, and the next version
+    learns the label from the store. If the trace is damaged, this is noted as an event in the
+    store's log.
 
     Returns
     -------
     bool
         False if the model keeps references and cannot change this one: nothing is changed, and the
         model must be trained again. True in all other cases, even if there was nothing to change:
-        the model is a baseline, which keeps no references; the reference has left the model; the
-        trace of the part has a fault; the decision is another cell's and its trace is damaged; or
-        the trace is damaged and would have to be added again.
+        the model is a baseline (handed in by the user), which keeps no references; the model has no
+        reference of this label any more; the trace has a fault and was never a reference; the
+        decision is another cell's and its trace is damaged; or the trace is damaged and would have
+        to be added again.
 
     Raises
     ------

@@ -106,10 +106,10 @@ class EngineSettings:
     def to_store(self) -> dict[str, str]:
         """Return the settings as texts by name, as `SqlStore.settings.save` takes them.
 
-        Settings at their defaults are left out, except the recipe, which is written in full, and
-        the seed; dengine's own version is added. Raises SettingError if a named reducer's class
-        must be imported for a default of the recipe, and cannot be, or if that default is out of
-        range.
+        The recipe (the settings of model, policy and retrains) is written in full; the seed and
+        dengine's own version are added. All other settings are left out if they have their
+        defaults. Raises SettingError if a named reducer's class must be imported for a default of
+        the recipe, and cannot be, or if that default is out of range.
         """
         texts = {"recipe": self.recipe.to_toml(), "seed": str(self.seed), "dengine": __version__}
         objects = {"model": self.model, "described": self.described}
@@ -132,7 +132,7 @@ class EngineSettings:
         model: Model | None = None,
         allow_import: bool | Collection[str] = False,
     ) -> Self:
-        """Return the settings of a used store.
+        """Return the settings of an engine from the texts that its store keeps.
 
         Parameters
         ----------
@@ -144,8 +144,9 @@ class EngineSettings:
             Objects that the engine was made with and the store cannot name. A reducer's name may be
             passed, too; it is not compared.
         allow_import : bool or collection of str
-            Whether any class that the recipe names may be imported, or which; a class that
-            `reducer` names is allowed.
+            Whether any class of the user that the recipe (the settings of model, policy and
+            retrains) names may be imported, or the names of those that may, `module:Class`; a class
+            that `reducer` names is allowed.
 
         Returns
         -------
@@ -154,14 +155,16 @@ class EngineSettings:
         Raises
         ------
         StoreError
-            For an unused store, a number that is negative or no number, a damaged `TraceSpec`, and
+            If the texts have no recipe, because no engine has used the store; for a number that is
+            negative or no number, a damaged `TraceSpec` (shape, rate and units of the traces), and
             a recipe that lacks settings.
         SettingError
             If the stored text is no recipe, if an object is missing or differs from the object that
             the engine was made with, if a text `reducer` is neither a name in `RECIPES`, a TOML
-            file of a recipe nor `module:Class`, or if a `model` is no baseline or is passed to an
-            engine that has its own. Also for a stored seed that is too large, and force limits that
-            do not fit the `TraceSpec`.
+            file of a recipe nor `module:Class`, or if `model` is no baseline (it lacks fit, add,
+            count, predict_interval or decide), or is passed although the engine trains the model of
+            its recipe. Also for a stored seed that is too large, and force limits (an operator's
+            limits of the force) that do not fit the `TraceSpec`.
         ImportRefusedError
             If the recipe names a class that may not be imported.
         """
@@ -197,13 +200,15 @@ class EngineSettings:
         )
 
     def with_template(self, model: Model | None) -> tuple[Self, EngineModel]:
-        """Return the settings in force and an untrained model: the recipe's, or `model` if given.
+        """Return settings and an untrained model: that of the recipe, or `model` if it is given.
 
-        If a user passed an object in place of a name, the settings are a copy that describes it.
-        For a `model`, a baseline, the recipe stays, though not all of it has an effect. Without one
-        the recipe's reducer and the rule of its policy are made, for which classes of the user's
-        are imported. Raises SettingError if they cannot be made, and for a `model` that is no
-        baseline; other errors of the constructor of a user's class are raised as they are. These
+        If a user passed an object in place of a name, a reducer or `model`, the settings are a copy
+        of these that describes it; otherwise they are these settings. A `model` is a baseline: it
+        decides by its own rule, so not all of the recipe has an effect; the recipe stays in the
+        settings. Without a `model` the recipe's reducer and the decision rule of its policy are
+        made, and classes of the user that they need are imported. Raises SettingError if they
+        cannot be made, and if `model` is no baseline: it lacks fit, add, count, predict_interval or
+        decide. Other errors of the constructor of a user's class are raised as they are. These
         settings are not changed.
         """
         if model is None:
@@ -215,21 +220,23 @@ class EngineSettings:
         return replace(self, model=template.name, described=template.description), template
 
     def check_request(self, request: Settings) -> None:
-        """Raise SettingError if settings that a program gives are not the settings in force.
+        """Raise SettingError if settings that a program gives differ from these settings.
 
         `request` holds settings by name, as `DataEngine` takes them; None is a setting that was not
         given. All settings of a recipe or policy in it are compared, its defaults included. An
-        unknown name is an error, too; so are `model` and the names of `RunOptions`, which the
-        caller must take out before. For a model that was handed in only settings that have an
-        effect on any model are compared (`LOOP_SETTINGS`: seed, trace, retrain_every, budget,
-        max_steps, window, audit_rate, stops, label_within and force_limits).
+        unknown name is an error, too; so are `model` and the names of `RunOptions` (executor,
+        replaying, clock, on_safe_mode), which the caller must take out before. If the user handed
+        in a model, which decides by its own rule, only settings that have an effect on any model
+        are compared (`LOOP_SETTINGS`: seed, trace, retrain_every, budget, max_steps, window,
+        audit_rate, stops, label_within and force_limits).
 
-        Not compared are the shadow mode, and force limits that the program leaves out, because an
-        operator sets both while the robot cell runs. Nor is a reducer that is an object, with its
-        parameters, nor `params` without the name of a reducer. A `trace` is compared only if a
-        `TraceSpec` is in force; a rate, units and columns that it leaves out are not compared. A
-        recipe that cannot be read, or that names another reducer than the request's, is a
-        SettingError, too.
+        Not compared are the shadow mode (every part is verified), and force limits (an operator's
+        limits of the force) that the program leaves out, because an operator sets both while the
+        robot cell runs. Nor is a reducer that is an object, with its parameters, nor `params`
+        without the name of a reducer. A `trace` is compared only if these settings have a
+        `TraceSpec` (shape, rate and units of the traces); a rate, units and columns that it leaves
+        out are not compared. A recipe that cannot be read, or that names another reducer than the
+        request's, is a SettingError, too.
         """
         given = {name: value for name, value in request.items() if value is not None}
         reducer = given.pop("reducer", None)
@@ -274,15 +281,20 @@ def _with_objects(
 ) -> Recipe:
     """Return a stored recipe, with the reducer object put into it if the recipe cannot name it.
 
-    `texts` are the store's settings, and `name` is the name of the store for messages. A recipe
-    that names its reducer is returned as it is. With such a recipe `reducer` may be None, a name,
-    which is not compared here, or an object that `to_toml` writes with the recipe's name and
-    parameters, so none if the recipe has a short name like "conv"; SettingError is raised for any
-    other object. With a model any reducer is accepted. Raises SettingError, too, if an object that
-    the recipe cannot name is missing or differs from the one that the store was made with (a
-    reducer in its description, a model in its class alone), if a `model` is passed to an engine
-    that trains the recipe's own model, or if `BaselineAdapter` refuses the model. A store that
-    holds no description of its object accepts any.
+    A recipe has the settings of model, policy and retrains. It cannot name a reducer that TOML does
+    not describe, like a pipeline, nor a `model` of the user, which decides by its own rule: the
+    user must hand in such an object each time. `texts` are the store's settings, and `name` is the
+    name of the store for messages. If the store's engine has a `model` of the user, any `reducer`
+    is accepted, and the recipe is returned as it is. So is a recipe that names its reducer. With
+    such a recipe `reducer` may be None, a name, which is not compared here, or an object of the
+    class (`module:Class`) and with the parameters that the recipe names; if the recipe has a short
+    name like "conv", no object is accepted.
+
+    Raises SettingError for another object as `reducer`; if an object that must be handed in is
+    missing, or differs from the one that the store was made with (a reducer in its class and
+    parameters, a model in its class alone; a store without a description of its object accepts
+    any); if a `model` is passed to an engine that trains the recipe's own model; and if the model
+    lacks fit, add, count, predict_interval or decide (`BaselineAdapter`).
     """
     if "model" in texts and model is None:
         raise SettingError(
@@ -315,11 +327,11 @@ def _with_objects(
 
 
 def _check_description(texts: Mapping[str, str], name: str, description: str) -> None:
-    """Raise SettingError if an object that is handed in again has other settings than before.
+    """Raise SettingError if an object that the user hands in again differs from the one before.
 
-    `description` is that of the object. It is compared with the setting "described" of the store,
-    among `texts`, if there is one; if there is none, nothing is compared. `name` is the name of the
-    store, for the message.
+    `description` is a text with the object's class and, if it is a reducer, its parameters. It is
+    compared with the setting "described" of the store, among `texts`, if there is one; if there is
+    none, nothing is compared. `name` is the name of the store, for the message.
     """
     made_with = texts.get("described")
     if made_with is not None and description != made_with:
@@ -332,11 +344,12 @@ def _check_description(texts: Mapping[str, str], name: str, description: str) ->
 def choose_recipe(reducer: Any, recipe: Any, given: Settings) -> Recipe:
     """Return the recipe that is asked for, with the settings of `given` in place of its own.
 
-    `recipe` is what `Recipe.load` takes, such as a Recipe, a name or a TOML file. If it is None,
-    the recipe is loaded from `reducer`, or from "conv" if both are None. A setting of None keeps
-    the recipe's own. Raises SettingError if `recipe` names another reducer than `reducer`, if no
-    recipe can be read from the one that is loaded, for a setting out of range, and for a class that
-    must be imported for a default and cannot be; TypeError for an unknown setting.
+    A recipe has the settings of model, policy and retrains. `recipe` is what `Recipe.load` takes,
+    such as a Recipe, a name or a TOML file. If it is None, the recipe is loaded from `reducer`, or
+    from "conv" if both are None. `given` holds settings by name; None keeps the recipe's own.
+    Raises SettingError if `recipe` names another reducer than `reducer`, if what is loaded is no
+    recipe, for a setting out of range, and for a class that must be imported for a default and
+    cannot be; TypeError for an unknown setting.
     """
     source = recipe
     if source is None:
@@ -368,10 +381,11 @@ def named_classes(
 def check_imports(recipe: Recipe, store: str, allow_import: bool | Collection[str]) -> None:
     """Raise ImportRefusedError if a stored recipe names a class that may not be imported.
 
-    Whoever writes to the store could otherwise run code here. Only classes of the user are checked,
-    the reducer's and the decision rule's (`Recipe.user_classes`). With `allow_import` True any of
-    them is allowed, with False none; else it holds the names of the allowed ones, `module:Class`.
-    `store` is the store's name in the message.
+    A recipe has the settings of an engine. Whoever writes to the store could otherwise run code
+    here. Only classes of the user are checked, the reducer's and the decision rule's
+    (`Recipe.user_classes`). With `allow_import` True any of them is allowed, with False none; else
+    it holds the names of the allowed ones, `module:Class`. `store` is the store's name in the
+    message.
     """
     if allow_import is True:
         return
@@ -409,12 +423,13 @@ def fill_from_peers(
 ) -> dict[str, Any]:
     """Return a copy of a new engine's settings, in which a peer's replace some that were not given.
 
-    A peer is another robot cell of the store's product; the first peer that has settings is taken.
-    Its seed is taken if `request` has none (0 without a peer), and its recipe if `request` names
-    neither reducer, recipe nor model. The recipe is not taken if the peer was given an object, a
-    reducer or a model. Nothing is imported. Raises ImportRefusedError if the recipe names a class
-    that may not be imported (`check_imports`), SettingError if the recipe cannot be read,
-    ValueError if the seed cannot be read, and StoreError if the database fails.
+    A peer is another robot cell in the store that makes the same product; the first peer that has
+    settings is taken. The peer's seed is taken if `request` has none (0 without a peer), and its
+    recipe (the settings of model, policy and retrains) if `request` names neither reducer, recipe
+    nor model. The recipe is not taken if the peer was given an object, a reducer or a model.
+    Nothing is imported. Raises ImportRefusedError if the recipe names a class that may not be
+    imported (`check_imports`), SettingError if the recipe cannot be read, ValueError if the seed
+    cannot be read, and StoreError if the database fails.
     """
     peer = next(iter(store.settings.of_peers().values()), {})
     filled = dict(request)
@@ -431,11 +446,11 @@ def fill_from_peers(
 def check_model_settings(reducer: Any, given: Settings) -> None:
     """Raise SettingError for settings that have no effect beside a model that is handed in.
 
-    `reducer` is the setting of that name, and `given` holds the other settings by name; None is a
-    setting that was not given. Reducer, radius and folds have no effect and must not be given. In
-    `given["policy"]` only the fields in `BASELINE_SETTINGS` have an effect (audit_rate, stops,
-    label_within, force_limits and shadow); any other field must be at its default. Settings of
-    other names pass.
+    A model that the user hands in decides by its own rule. `reducer` is the setting of that name,
+    and `given` holds the other settings by name; None is a setting that was not given. Reducer,
+    radius and folds have no effect and must not be given. In `given["policy"]` only the fields in
+    `BASELINE_SETTINGS` have an effect (audit_rate, stops, label_within, force_limits and shadow);
+    any other field must be at its default. Settings of other names pass.
     """
     idle = [name for name in ("radius", "folds") if given.get(name) is not None]
     if reducer is not None:
@@ -497,8 +512,11 @@ class SettingsInForce:
     def change(self, settings: EngineSettings) -> None:
         """Use other settings from now on, without saving them.
 
-        `conditions`, what a decision depends on beside the model, are made of them. They are None
-        if the settings have no `TraceSpec`. `is_unsaved` stays as it is.
+        The attribute `conditions`, what a decision depends on beside the model, is made of them:
+        the `TraceSpec` (shape, rate and units of the traces), the operator's force limits, the
+        share of audits (checks of parts that the model is certain of) and the seed. It is None if
+        the settings have no `TraceSpec`. The attribute `is_unsaved` (whether the store lacks the
+        present settings) stays as it is.
         """
         policy = settings.recipe.policy
         self.now = settings
@@ -509,13 +527,16 @@ class SettingsInForce:
             )
 
     def save(self) -> None:
-        """Write the settings to the store; with a journal, wait at most for the outbox's `limit`.
+        """Write the settings to the store and wait for it; a failure of the store is only logged.
 
-        A write that is committing gets 2 s more. If the store does not take them, or does not
-        answer in time, the error is logged and `is_unsaved` is set, which a later success clears; a
-        commit that was too slow may still happen. Raises SettingError if another robot cell of the
-        product has settings that contradict these, or a recipe of the two cannot be read; then
-        nothing is written, and `is_unsaved` stays as it is.
+        If the engine has a journal (a local file that gets its records before the store), it waits
+        at most for the outbox's `limit` in seconds, and 2 s more for a write that is committing;
+        without a journal there is no time limit. If the store does not take the settings, or does
+        not answer in time, the error is logged, and the attribute `is_unsaved` is set, which a
+        later success clears; a commit that was too slow may still happen. Raises SettingError if
+        another robot cell of the product (cells that share labels) has settings that contradict
+        these, or the recipe of one of the two cannot be read; then nothing is written, and
+        `is_unsaved` stays as it is.
         """
         texts = self.now.to_store()
         try:

@@ -67,7 +67,8 @@ class EngineState:
     def complete(self, status: Status) -> Status:
         """Return a copy of a status from the store, completed by what only the engine knows.
 
-        That is the version in force, the reason of a safe mode, the number of labels since the
+        That is the number of the model version that decides now, the reason of a safe mode (after
+        an alarm every part is verified; "" outside a safe mode), the number of labels since the
         newest retrain began, what is wrong with the store (`store_fault`), the age of the oldest
         record that the store lacks, and whether a retrain is under way (`is_retraining`).
         """

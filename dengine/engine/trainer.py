@@ -71,9 +71,9 @@ class TrainingWindow:
     def add(self, trace: TraceArray, label: int, hash_: int, seq: int) -> None:
         """Add one labelled trace, shape (channels, samples); a full window loses its oldest one.
 
-        `label` is 1 (good) or 0 (bad), `hash_` the `content_hash` of the trace's `StoredDecision`,
-        and `seq` the label's number, which must be larger than any before; this is not checked. All
-        traces must have one shape. The trace is copied.
+        `label` is 1 (good) or 0 (bad), `hash_` a hash of the part's number or of the trace
+        (`StoredDecision.content_hash`), and `seq` the label's number, which must be larger than any
+        before; this is not checked. All traces must have one shape. The trace is copied.
         """
         if self._end == len(self._block[0]):
             self._enlarge(trace.shape)
@@ -122,8 +122,8 @@ class TrainingWindow:
     def row_after(self, seq: int) -> tuple[int, TraceArray, int, int] | None:
         """Return the first label of the window with a number above this one; None without any.
 
-        It is the label's number, its trace (channels, samples), the label (1 good, 0 bad) and its
-        hash. The trace is a view, not to be written to.
+        It is the label's number, its trace (channels, samples), the label (1 good, 0 bad) and the
+        hash that `add` got. The trace is a view, not to be written to.
         """
         i = self._end - self.count_newer(seq)
         if i == self._end:
@@ -171,9 +171,9 @@ class TrainedOn:
         """Return the four attributes as arrays by name, for the store; `from_state` reads them.
 
         Their names are "trained_on" (`seq`, the numbers of the labels), "trained_as"
-        (`corrected_to`, the number of the newest correction), "counts_from" (labels with larger
-        numbers are new) and "pinned" (the number of the earlier version that a rollback put in
-        force again, else 0).
+        (`corrected_to`, the number of the newest correction of a label that they had),
+        "counts_from" (labels with larger numbers are new for the next retrain) and "pinned" (the
+        number of the earlier version that a rollback put in force again, else 0).
         """
         return {
             "trained_on": self.seq,
@@ -186,7 +186,7 @@ class TrainedOn:
     def from_state(cls, state: Mapping[str, NDArray[Any]]) -> Self:
         """Return the record that `to_state` turned into arrays.
 
-        Without "pinned" the version counts as not pinned (put in force again by a rollback). Arrays
+        Without "pinned" this attribute is 0: no rollback has put the version in force again. Arrays
         of other names are ignored. Raises KeyError without "trained_on", "trained_as" or
         "counts_from".
         """
@@ -289,8 +289,9 @@ class Retrainer:
     def _step_seconds(self) -> float | None:
         """Return the seconds after which the next training begins no step; None without a budget.
 
-        They are the time budget, less the longest time that one of the newest 20 trainings took for
-        its last step and the work after it; but at least 30 % and at most 70 % of the budget.
+        They are the time budget of a retrain, less the longest time that one of the newest 20
+        trainings took for its last optimiser step and the work after it; but at least 30 % and at
+        most 70 % of the budget.
         """
         if self.budget is None:
             return None
@@ -323,12 +324,14 @@ class Retrainer:
         """Begin to train a successor of the current model in the executor, on the present window.
 
         The model decides whether a successor starts from the weights of the current model or from
-        scratch. `collect` returns the outcome; no other training may be under way, which is not
-        checked. The training waits in the executor until a discarded one is done. Returns False,
-        and begins nothing, if there is no executor, or if it refuses work, or hangs with a
-        discarded training (is not done with it after 60 s). An executor that refuses work or hangs
-        is started again if it can be, and otherwise an executor that refuses work is given up,
-        unless it still works on a discarded training. Logged are the first training, if the
+        scratch. `collect` returns the outcome. No other training may be under way, which is not
+        checked; but the executor may still work on a training that `discard` gave up, and the new
+        one waits there until that is done.
+
+        Returns False, and begins nothing, if there is no executor, if it refuses work, or if it
+        hangs: it is not done with a discarded training after 60 s. An executor that refuses work or
+        hangs is started again if it can be. If it cannot be, an executor that refuses work is given
+        up, unless it still works on a discarded training. Logged are the first training, if the
         executor's process has imported its modules by then, the refusal, a restart that fails, and
         the giving up. What copying a user's model raises is raised.
         """
@@ -373,11 +376,11 @@ class Retrainer:
     def _count_seconds_left(self) -> float:
         """Return how many seconds the executor's training has left, before it counts as hung.
 
-        It has HUNG seconds (60) from when the executor could begin with it: while the executor's
-        process still imports modules, and when a discarded training is done, the count starts anew
-        with this call, which sets `_began`, and `_discarded` to None. At 0 or below the training
-        counts as hung; if none was begun, the number means nothing. A training that waits for a
-        discarded one that hangs counts as hung, too.
+        It has 60 s (HUNG) from when the executor could begin with it. This call lets the 60 s begin
+        anew, by setting `_began`, while the executor's process still imports modules, and if a
+        discarded training (one that `discard` gave up) is done by now; `_discarded` is then set to
+        None. At 0 or below the training counts as hung, also if it only waits for a discarded one
+        that hangs. If no training was begun, the number means nothing.
         """
         now = time.monotonic()
         executor = self.executor
@@ -392,13 +395,14 @@ class Retrainer:
         """Return the outcome of the training in the executor, once.
 
         Returns None if there is none or it is not done. With `wait` above 0 it blocks for at most
-        `wait` seconds, and a training that is not done then is given up. So is, whatever `wait` is,
-        a training that hangs, or whose executor died; this is logged. The outcome of a training
-        that was given up or failed has no model and says why. An executor that died or hangs is
-        started again if it can be. Otherwise retrains run without it: from then on if it died, else
-        until it is free. `begin` of the outcome is now minus the duration of the training. How long
-        the training took for its last step and the work after it is remembered: the longest of the
-        newest 20 is reserved in the budget of the next.
+        `wait` seconds, and a training that is not done then is given up. Whatever `wait` is, a
+        training that hangs (is not done after 60 s), or whose executor died, is given up, too; this
+        is logged. The outcome of a training that was given up or failed has no model and says why.
+        An executor that died or hangs is started again if it can be. Otherwise retrains run without
+        it: from then on if it died, else until it is free. `begin` of the outcome is now minus the
+        duration of the training. How long the training took for its last optimiser step and the
+        work after it is remembered: the longest of the newest 20 is reserved in the time budget of
+        the next.
         """
         future = self.future
         left = self._count_seconds_left()
@@ -416,8 +420,9 @@ class Retrainer:
         """Log why a training failed, and return it as the reason of a dropped retrain.
 
         `error` is what the training, or waiting for it, raised; the reason begins with "dropped: ".
-        If the training is not done and its executor lives, it is discarded. An executor that died,
-        or in which a training hangs, is started again or taken out of use (`_replace_executor`).
+        If the training is not done and its executor lives, it is discarded: it ends by itself, and
+        its result is lost. An executor that died, or in which a training hangs, is started again or
+        taken out of use (`_replace_executor`).
         """
         is_broken = isinstance(error, BrokenExecutor)
         training_raised = future.done() and not is_broken
@@ -433,11 +438,12 @@ class Retrainer:
         return f"dropped: RuntimeError: {failure}"
 
     def _replace_executor(self) -> None:
-        """Start a `RestartableExecutor` again; go on without any other executor.
+        """Restart the executor if it is a `RestartableExecutor`; otherwise go on without it.
 
-        A restart ends what it works on. If it raises OSError, that is logged, and the next retrain
-        tries again. Any other executor is set to None, which is logged; but if it still works on a
-        discarded training, it is kept, and used again once that is done.
+        A restart ends what the executor works on. If it raises OSError, that is logged, and the
+        next retrain tries again. Any other executor is set to None, which is logged; but if it
+        still works on a discarded training (one that was given up), it is kept, and used again once
+        that is done.
         """
         executor = self.executor
         if isinstance(executor, RestartableExecutor):
@@ -459,17 +465,20 @@ def train_candidate(
 ) -> Trained:
     """Train a model on labelled traces and return the outcome.
 
-    The outcome has the model, a reason in words, the number of steps, the durations of all and of
-    the last step with all after it (0 without a step or without `step_seconds`), and the sequence
-    numbers of the labels. `successor` is the model, which this changes in place. No step begins
-    after `step_seconds` seconds or `max_steps` steps; None is no limit. Any exception, a window
-    without traces, and a defect of the trained model give an outcome without a model, whose reason
-    begins with "dropped: ". A training that reaches a limit ends early and is accepted; its reason
-    says so if `step_seconds` ended it and the model's report has `n_steps_left` above 0. The reason
-    of each accepted training has the note (a line for the operator) of that report, if there is
-    one. `clock` returns seconds. The modules that a training imports are loaded first; their time
-    does not count, and a failure of this is logged. Sets the present thread to one torch thread. It
-    is a plain function, so that any executor can run it.
+    The outcome has the model, a reason in words, the number of optimiser steps, the duration of the
+    training, that of its last step with all work after it (0 without a step or without
+    `step_seconds`), and the sequence numbers of the labels. `successor` is the model, which this
+    changes in place. No step begins after `step_seconds` seconds or `max_steps` steps (None is no
+    limit); only the first training of a model may take a few steps after `step_seconds`. A training
+    that reaches a limit ends early and is accepted. Its reason says so if `step_seconds` ended it
+    and the model's report has `n_steps_left` above 0. The reason of each accepted training has the
+    note (a line for the operator) of that report, if there is one. Any exception, data without
+    traces, and a defect of the trained model (`EngineModel.defect`) give an outcome without a
+    model, whose reason begins with "dropped: ".
+
+    `clock` returns seconds. The modules that a training imports are loaded first; their time does
+    not count, and a failure of this is logged. Sets the present thread to one torch thread. It is a
+    plain function, so that any executor can run it.
     """
     torch.set_num_threads(1)  # it holds for the present thread only
     guarded(NOT_PRECOMPUTED, successor.warm_up)

@@ -79,7 +79,7 @@ class Baseline(ABC):
         """Train from scratch and return self; the attribute `is_trained` says whether that worked.
 
         If the labels are of one class, or too few for the method, the baseline is untrained
-        afterwards, and every part is verified.
+        afterwards, and `decide` returns VERIFY for every part.
 
         Parameters
         ----------
@@ -136,9 +136,10 @@ class Baseline(ABC):
         """Return an `Action` for each trace of X (n, C, T), as an array of objects, shape (n,).
 
         It is ACCEPT if the lower bound of the success probability is at least the accept threshold,
-        REJECT if the upper bound is at most the reject threshold, and otherwise VERIFY. If both
-        hold, it is ACCEPT. The attribute `thresholds` has both thresholds; if it is None, they are
-        LB, which is `policy.lower_bound`, and 1 - LB. Raises TraceError like `predict`.
+        REJECT if the upper bound is at most the reject threshold, and otherwise VERIFY (check the
+        part). If both hold, it is ACCEPT. The attribute `thresholds` has both thresholds; if it is
+        None, they are `policy.lower_bound` and 1 - `policy.lower_bound`. Raises TraceError like
+        `predict`.
         """
         default = (self.policy.lower_bound, 1.0 - self.policy.lower_bound)
         accept_threshold, reject_threshold = self.thresholds or default
@@ -153,8 +154,9 @@ class Baseline(ABC):
 
         The last result is cached: the same object is returned again for the same traces until the
         next `fit` or `add`, so do not change it. While `is_trained` is False, all lower bounds are
-        0 and all upper bounds 1. A baseline that counts no labels returns the integer 0, and no
-        array, for both counts; so does an untrained one. Traces (n, T) have one channel. Raises
+        0 and all upper bounds 1. The counts `n_success` and `n_failure` are the numbers of good and
+        bad labelled traces behind each prediction. A baseline that counts none returns the integer
+        0, and no array, for both; so does an untrained one. Traces (n, T) have one channel. Raises
         TraceError if X has neither shape, or has values that are no real numbers; NaN and
         infinities pass. It is not checked here that the traces are as long as those of the
         training.
@@ -303,16 +305,18 @@ BASELINES: dict[str, type[Baseline]] = {
 
 
 def make_baseline(name: str, policy: Policy, seed: int = 0, **params: Any) -> Baseline:
-    """Make an untrained baseline for `DataEngine(model=...)`.
+    """Make an untrained baseline, a method to compare with, for `DataEngine(model=...)`.
 
     Parameters
     ----------
     name : str
-        A name in `BASELINES`, or `module:Class` of a subclass of `Baseline`, which is imported.
+        A name in `BASELINES` ("knn", "always", "never"), or `module:Class` of a subclass of
+        `Baseline`, which is imported.
     policy : Policy
-        Its alpha and lower_bound are the baseline's; the rest belongs to the engine.
+        Its alpha (error level) and lower_bound (least success probability of an accepted part) are
+        the baseline's; the other fields belong to the engine.
     seed : int, default 0
-        Of everything drawn.
+        Of everything that is drawn at random.
     **params
         The baseline's own settings, the keyword-only fields of its dataclass; those left out have
         their defaults.
@@ -334,8 +338,9 @@ def make_baseline(name: str, policy: Policy, seed: int = 0, **params: Any) -> Ba
 def baseline_class(name: str) -> type[Baseline]:
     """Return the class of a baseline by its name in `BASELINES`, or import it from `module:Class`.
 
-    A name with a colon is always imported, which runs the module's code. Raises SettingError for an
-    unknown name, a class that cannot be imported, or a class that is no subclass of `Baseline`.
+    A baseline is a method to compare with; `BASELINES` has "knn", "always" and "never". A name with
+    a colon is always imported, which runs the module's code. Raises SettingError for an unknown
+    name, a class that cannot be imported, or a class that is no subclass of `Baseline`.
     """
     kind = import_class(name) if ":" in name else BASELINES.get(name, object)
     if not issubclass(kind, Baseline):

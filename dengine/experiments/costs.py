@@ -192,12 +192,16 @@ class CostCurve:
     def missing(self) -> Missing | None:
         """What evidence would turn the verdict "may pay" into "pays", as a `Missing`.
 
-        It gives one need in three units: how many different accepted parts in all (those seen
-        included), how many recordings beside the present ones, or how many parts of production
-        without any recordings would show it. In production only the audited share of the parts
-        counts: each part if the policy has stops "all"; 5 % (`AUDIT_RATE`) if it has no audits. It
-        is assumed that the shares of wrong decisions stay as they were seen. None if the verdict is
-        another, or if 10,000 times the parts of a shuffle, a replay in random order, are too few.
+        The verdict is "may pay" if the policy is cheaper than checking every part, but the interval
+        of its cost does not show this yet. One need is given in three units: how many different
+        accepted parts in all (those seen included), how many recordings beside the present ones, or
+        how many parts of production without any recordings would show it. In production only parts
+        whose outcome is asked for count: each part if the policy has stops "all" (every bad
+        accepted part stops the line and is reported), otherwise the audited share (parts that are
+        checked at random although the model is certain), which is taken as 5 % (`AUDIT_RATE`) if
+        the policy has no audits. It is assumed that the shares of wrong decisions stay as they were
+        seen. None if the verdict is another, or if 10,000 times the parts of a shuffle (a replay in
+        random order) are too few.
         """
         row = self.marked
         if self.verdict != "may pay":
@@ -241,13 +245,14 @@ class CostCurve:
 
     @property
     def sentence(self) -> str:
-        """The verdict as sentences: the chosen policy, its cost with the interval, and, if it may
-        pay, how many more parts would show that it pays, unless these are too many (`missing`).
+        """The verdict as sentences: the chosen policy, its cost per part, and evidence it lacks.
 
-        If no policy pays or may pay, they begin with "Nothing pays" and give the cost of the
-        cheapest policy, or ask for more recordings if every part was verified. They also say if
-        another policy is cheaper than the chosen one, but not significantly, and if the search was
-        interrupted. They always say what verifying everything costs.
+        They give the cost with its 95 % interval, and what verifying everything costs. If the
+        policy may pay, they say how many more parts would show that it pays, unless these are too
+        many (`missing`). If no policy pays or may pay, they begin with "Nothing pays" and give the
+        cost of the cheapest policy, or ask for more recordings if every part was verified. They
+        also say if another policy is cheaper than the chosen one, but not significantly, and if the
+        search was interrupted.
         """
         row = self.marked
         cheapest = self.rows[0]
@@ -301,11 +306,12 @@ class CostCurve:
     def to_frame(self) -> "pd.DataFrame":
         """Return a DataFrame with a row for each policy that was played.
 
-        Its columns are the guarantee, alpha and lower_bound of the policy and the fields of
-        `PolicyCost`: costs in the user's unit, and shares and error rates from 0 to 1. Of `bad` and
-        `good` each field is a column, like `bad_rate`. `chosen` is True for the policy that pays or
-        may pay, if there is one. `reported` is False for the policies that were left behind.
-        Their costs come from earlier shuffles and are not comparable with those of other rows.
+        Its columns are the guarantee (the rule that decides), alpha and lower_bound of the policy
+        and the fields of `PolicyCost`: costs in the user's unit, and shares and error rates from 0
+        to 1. Of `bad` and `good` each field is a column, like `bad_rate`. `chosen` is True for the
+        policy that pays or may pay, if there is one. `reported` is False for the policies that the
+        search left behind, because they were dearer in earlier shuffles (replays in random order).
+        Their costs come from these shuffles and are not comparable with those of other rows.
         """
         import pandas as pd
 
@@ -324,9 +330,10 @@ class CostCurve:
 def policy_name(policy: Policy) -> str:
     """Return a policy's name for people, like "alpha 0.1, LB 95 %" or "pooled, LB 95 %".
 
-    For a user's own rule it is "module:Class, LB 95 %". Under the guarantee "cost" it is only "the
-    cost guarantee". Only under "local" is alpha in it, so two policies with a rule of the user's
-    own that differ in alpha have the same name.
+    LB is `lower_bound`, the success probability that accepted parts must have. Under the guarantee
+    (the rule that decides) "cost" the name is only "the cost guarantee"; for a user's own rule it
+    is "module:Class, LB 95 %". Only under "local" is alpha in it, so two policies of another
+    guarantee that differ in alpha have the same name.
     """
     if policy.guarantee == "cost":
         return "the cost guarantee"
@@ -335,13 +342,12 @@ def policy_name(policy: Policy) -> str:
 
 
 def settings_of(policy: Policy) -> Settings:
-    """Return the settings by which the policies of `dengine costs` differ, as keyword arguments of
-    `Policy`.
+    """Return the settings in which policies of `dengine costs` differ, as arguments of `Policy`.
 
-    They are alpha, lower_bound and guarantee, or only the prices under the guarantee "cost", which
-    they imply. stops is added if it is "all", and alpha under "cost" and audit_rate if they are not
-    those of a new policy. The interval, the force limits and all other settings are left out;
-    lower_bound has no effect under "cost".
+    They are alpha, lower_bound and guarantee (the rule that decides). For the guarantee "cost" they
+    are only `prices`, from which `Policy` infers this guarantee; lower_bound has no effect then.
+    stops is added if it is "all", and alpha under "cost" and audit_rate if they are not those that
+    `Policy` gives by itself. The interval, the force limits and all other settings are left out.
     """
     names = ["prices"] if policy.guarantee == "cost" else ["alpha", "lower_bound", "guarantee"]
     settings = {name: getattr(policy, name) for name in names}
@@ -358,12 +364,14 @@ def candidates(
 ) -> Iterator[Settings]:
     """Yield the settings of each policy that is to be tried, as keyword arguments of `Policy`.
 
-    First come all pairs of an alpha and a lower bound LB (the success probability that accepted
-    parts must have) for the guarantee "local", or for the user's own rule if the contender has one.
-    Then come "pooled" at each LB, and "cost" once with the prices `costs`, both with the
-    contender's own alpha, but not for a user's own rule or a baseline. If the contender's policy
-    has stops="some" and no audits, these two get an audit rate of 5 %, because they need outcomes
-    of accepted parts.
+    The contender plays the replays: it is dengine with a recipe (all settings), or a baseline (a
+    method to compare with). First come all pairs of an alpha (error level) and a lower bound LB
+    (the success probability that accepted parts must have) for the guarantee "local" (a guarantee
+    is the rule that decides), or for the user's own rule if the contender has one. Then come
+    "pooled" at each LB, and "cost" once with the prices `costs`, both with the contender's own
+    alpha, but not for a user's own rule or a baseline. If the contender's policy has stops="some"
+    (not every bad accepted part is reported) and no audits (checks of parts that the model is
+    certain of), these two get an audit rate of 5 %, because they need outcomes of accepted parts.
 
     LBs come the lowest first. If `lower_bounds` is empty, they are taken around break-even, at
     which 1 - LB is check / escape: 1 - LB is that ratio times 0.5, 1, 2, 4, 8 and 16 for "local"
@@ -402,12 +410,12 @@ def candidates(
 def needed_parts(policy: Policy) -> int:
     """Return the least number of good parts that a policy needs before it can accept a part.
 
-    For the guarantee "local" this is the number of good labels within the radius, without a bad
-    one, that puts the lower end of the policy's interval at LB (`Policy.lower_bound`): z^2 LB /
-    (1 - LB), rounded up, with Wilson's interval; it is 10,000,000 if more are needed. For "pooled"
-    it is the number of checked parts, all good, that give enough evidence at error level alpha;
-    their scores must reach one of the levels that the rule may take as accept threshold. For other
-    guarantees it is 0.
+    For the guarantee "local" (a guarantee is the rule that decides) this is the number of good
+    labels within the radius around the part, without a bad one, that puts the lower end of the
+    policy's interval at LB (`Policy.lower_bound`): z^2 LB / (1 - LB), rounded up, with Wilson's
+    interval; it is 10,000,000 if more are needed. For "pooled" it is the number of checked parts,
+    all good, that give enough evidence at error level alpha, if the score of each reaches the
+    threshold that the rule tests. For other guarantees it is 0.
     """
     if policy.guarantee == "local":
         return 1 + bisect_left(
@@ -437,14 +445,15 @@ def cost_curve(
 ) -> CostCurve:
     """Find the policy that pays by three prices, and what a part costs under it.
 
-    The candidate policies are replayed on shuffles of the recordings. While there are more than
-    two, they play two shuffles (on the scores of one engine that checks every part, unless a
-    baseline plays), and the dearer half (of an odd number the larger half, but of three one) is
-    left behind; policies that verified every part count as the dearest. All others are compared by
-    their expected cost over all shuffles so far. The last two, or the only one, play fresh
-    shuffles, by which no policy was chosen. A policy with a setting that is refused, like an LB out
-    of range, or that needs more good parts than a shuffle has, is not tried; the field
-    `out_of_reach` of the result says so.
+    A policy is the settings of the rule that decides. The candidate policies are replayed on
+    shuffles, random orders of the recordings. While there are more than two, they play two shuffles
+    (on the recorded predictions of one engine that checks every part, unless a baseline plays), and
+    the dearer half (of an odd number the larger half, but of three one) is left behind. Policies
+    that verified every part count as the dearest; all others are compared by their expected cost
+    over all shuffles so far. The last two, or the only one, play fresh shuffles, by which no policy
+    was chosen. A policy with a setting that is refused, like a lower bound out of range, or that
+    needs more good parts than a shuffle has, is not tried; the field `out_of_reach` of the result
+    says so.
 
     Parameters
     ----------
@@ -456,11 +465,12 @@ def cost_curve(
     recipe : object, default "conv"
         Anything `Contender.load` takes. The guarantee of its policy (the rule by which it decides)
         is replaced, with alpha and lower_bound under "local", with lower_bound under "pooled", and
-        with the prices under "cost". Its other settings stay, also shadow mode, in which every part
-        is verified and no policy pays. But if its policy has no audits (checks of parts that the
-        model is certain of) and stops="some", the guarantees "pooled" and "cost" get an audit rate
-        of 5 %, because they need outcomes of accepted parts. A rule of the user's own keeps its
-        guarantee and gets alpha and lower_bound. A baseline plays "local" alone.
+        with the prices under "cost". Its other settings stay, but shadow mode, in which every part
+        is verified, is turned off. If its policy has no audits (checks of parts that the model is
+        certain of) and stops="some" (not every bad accepted part is reported), the guarantees
+        "pooled" and "cost" get an audit rate of 5 %, because they need outcomes of accepted parts.
+        A rule of the user's own keeps its guarantee and gets alpha and lower_bound. A baseline, a
+        method to compare with, plays "local" alone.
     alphas : sequence of float, default (0.1,)
         Values to try under the guarantee "local", or under a rule of the user's own.
     lower_bounds : sequence of float
@@ -482,7 +492,8 @@ def cost_curve(
     Returns
     -------
     curve : CostCurve
-        Its `policy` is None if no policy pays or may pay.
+        Its `rows` say what a part costs under each of the last policies. Its `policy` is the
+        choice; None if no policy pays or may pay.
 
     Raises
     ------
@@ -529,14 +540,17 @@ def find_policy(
     seed: int = 0,
     cycles: int | None = None,
 ) -> CostCurve | None:
-    """Do what `cost_curve` does, with replays that the caller plays.
+    """Find the policy that pays by three prices, like `cost_curve`; the caller plays the replays.
 
-    `play` returns the replays of a list of tasks, in this order. If it returns fewer, as after
-    Ctrl-C, nothing more is played. The result is then computed from the fresh shuffles (by which no
-    policy was chosen) that every policy has finished, if there are two or more. Otherwise it is
-    computed from the earlier ones, with its field `fresh` False; without two of these it is None.
-    The other parameters are those of `cost_curve`. Raises SettingError like `cost_curve`, and what
-    `play` raises.
+    A policy is the settings of the rule that decides. Candidates play two shuffles (random orders
+    of the recordings), the dearer half is left behind, and so on. The last two play `repeats` fresh
+    shuffles, by which no policy was chosen. `play` gets a list of tasks (replays to be played) and
+    returns their replays in this order. If it returns fewer, as after Ctrl-C, nothing more is
+    played. The result is then computed from the fresh shuffles that each of the last policies has
+    finished, if there are two or more. Otherwise it is computed from the earlier shuffles, with its
+    field `fresh` False; without two of these it is None. `costs` holds the three prices, and
+    `contender` is what `Contender.load` makes of the recipe; the other parameters are those of
+    `cost_curve`. Raises SettingError like `cost_curve`, and what `play` raises.
     """
     _check_search(data, costs, repeats)
     n_cycles = len(data) if cycles is None else cycles
@@ -581,7 +595,8 @@ def find_policy(
 def _finished(replays: Iterable[Replay], policies: Sequence[Policy]) -> Groups:
     """Return each policy's replays of the shuffles that all these policies have finished.
 
-    Empty if there are fewer than two such shuffles.
+    A shuffle is a random order of the recordings, by the seed of the replay. Returns an empty dict
+    if there are fewer than two such shuffles.
     """
     groups = _by_policy(replays)
     seeds = [{replay.seed for replay in groups.get(policy, ())} for policy in policies]
@@ -597,8 +612,9 @@ def _finished(replays: Iterable[Replay], policies: Sequence[Policy]) -> Groups:
 def _check_search(data: Dataset, costs: Costs, repeats: int) -> None:
     """Raise SettingError if no policy can be chosen.
 
-    That is so for fewer than two repeats, a check that costs as much as an escape or more, a false
-    reject that costs nothing, and recordings of one label.
+    That is so for fewer than two repeats, a check that costs as much as an escape (a bad part that
+    is accepted) or more, a false reject that costs nothing, and recordings of parts that are all
+    good or all bad.
     """
     expect(repeats >= 2, "2 or more repeats", repeats, "one says nothing of luck")
     expect(
@@ -626,10 +642,11 @@ def _within_reach(
 ) -> tuple[list[Policy], list[str]]:
     """Return the policies to be tried, without repeats, and notes on why others are not tried.
 
-    Each policy is that of the contender with some settings, an item of `changes`, which must hold
-    the `guarantee`. It is not tried if its settings are refused, or if it needs more good parts
-    before it can accept one (`needed_parts`) than `n_good`, the number of good parts that a shuffle
-    plays.
+    The contender plays the replays: it is dengine with a recipe, or a baseline. Each policy is that
+    of the contender with some settings, an item of `changes`, which must hold the `guarantee` (the
+    rule that decides). It is not tried if `Policy` refuses its settings, or if it needs more good
+    parts before it can accept one (`needed_parts`) than `n_good`, the number of good parts that a
+    shuffle plays.
     """
     policies = []
     out_of_reach = []
@@ -667,9 +684,11 @@ def _by_policy(replays: Iterable[Replay]) -> dict[Policy, list[Replay]]:
 def _tasks(
     contender: Contender, policies: Sequence[Policy], seeds: range, cycles: int
 ) -> list[Task]:
-    """Return the replays of a contender under each policy, for each seed, as tasks.
+    """Return a task, a replay to be played, for each seed and each policy.
 
-    Policies vary fastest. Each replay shuffles and plays `cycles` parts.
+    In each task the contender, who plays (dengine with a recipe, or a baseline), has the policy in
+    its recipe. Policies vary fastest. Each replay shuffles the parts by its seed and plays `cycles`
+    of them.
     """
     players = [
         replace(contender, recipe=replace(contender.recipe, policy=policy)) for policy in policies
@@ -682,11 +701,13 @@ def _screen(
 ) -> Iterator[Replay]:
     """Yield a replay of each policy for each seed; its recipe has the policy.
 
-    dengine is replayed once for each seed, in shadow mode and with the force limits of the
-    contender's recipe. The rule of each policy decides on its predictions (`replay_policy`); force
-    limits of `policies` are not applied. A baseline has no such predictions: each policy has a
-    replay of its own. Policies vary fastest. A replay shuffles and plays `cycles` parts. `play`
-    plays tasks and returns their replays; if it returns fewer, fewer are yielded.
+    dengine is replayed once for each seed, in shadow mode (every part is verified, and the model's
+    predictions are recorded) and with the force limits (an operator's limits of the force) of the
+    contender's recipe. The rule of each policy decides on these predictions (`replay_policy`);
+    force limits of `policies` are not applied. If the contender is a baseline (a method to compare
+    with), there are no such predictions: each policy has a replay of its own. Policies vary
+    fastest. A replay shuffles the parts by its seed and plays `cycles` of them. `play` plays tasks
+    and returns their replays; if it returns fewer, fewer are yielded.
     """
     if contender.baseline is not None:
         yield from play(_tasks(contender, policies, seeds, cycles))
@@ -706,12 +727,13 @@ def curve_of(
 ) -> CostCurve:
     """Return what a part costs under some policies at these prices, and which policy to choose.
 
-    `groups` has each policy with its replays, all of the same shuffles in the same order. The
-    choice, a policy's name or "check everything", is made again with each price halved and doubled;
-    choices that differ are in the field `price_changes` of the result. Three arguments become
-    fields of the result: `left_behind`, the policies that were dearer in earlier shuffles;
-    `out_of_reach`, policies that were not played, each with the reason; and `fresh`, whether no
-    policy was chosen by these shuffles.
+    `groups` has each policy (settings of the rule that decides) with its replays, all of the same
+    shuffles (random orders of the recordings) in the same order. The choice, a policy's name or
+    "check everything", is made again with each price halved and doubled; choices that differ are in
+    the field `price_changes` of the result. Three arguments become fields of the result:
+    `left_behind`, the policies that were dearer in earlier shuffles; `out_of_reach`, policies that
+    were not played, each with the reason; and `fresh`, whether no policy was chosen by these
+    shuffles.
     """
     rows, marked, verdict = _choose(groups, costs)
     chosen = _chosen_name(marked, verdict)
@@ -742,13 +764,14 @@ def curve_of(
 def _choose(groups: Groups, costs: Costs) -> tuple[list[PolicyCost], PolicyCost, str]:
     """Return a row for each policy in `groups`, the cheapest first, the best row, and the verdict.
 
-    `groups` has each policy with its replays. The rows are sorted by mean cost; among equal costs
-    the row with fewer bad accepted parts comes first, then the row with the higher LB. The best row
-    is the first, unless some rows accept fewer bad parts, are not dearer than the first at a
-    one-sided level of 5 %, and have an expected cost below the price of a check: then it is the row
-    of these with the fewest. The verdict is "does not pay" if the mean or the expected cost of the
-    best row is not below that price. Otherwise it is "pays" if the whole interval of its cost is
-    below that price, else "may pay".
+    `groups` has each policy (settings of the rule that decides) with its replays. The rows are
+    sorted by mean cost; among equal costs the row with fewer bad accepted parts comes first, then
+    the row whose policy has the higher lower bound. The best row is the first, unless some rows
+    accept fewer bad parts, are not dearer than the first at a one-sided level of 5 %, and have an
+    expected cost (with half an error added to each share of errors) below the price of a check:
+    then it is the row of these with the fewest. The verdict is "does not pay" if the mean or the
+    expected cost of the best row is not below that price. Otherwise it is "pays" if the whole
+    interval of its cost is below that price, else "may pay".
     """
     rows = [_policy_cost(policy, replays, costs) for policy, replays in groups.items()]
     rows.sort(key=lambda row: (row.cost, row.escaped, -row.policy.lower_bound))
@@ -777,10 +800,12 @@ def _chosen_name(row: PolicyCost, verdict: str) -> str:
 
 
 def _policy_cost(policy: Policy, replays: Sequence[Replay], costs: Costs) -> PolicyCost:
-    """Return what a part costs under a policy, from its replays: mean cost with an interval, shares
-    of decisions, and error rates, as the fields of `PolicyCost`.
+    """Return what a part costs under a policy, as a `PolicyCost` that is computed from its replays.
 
-    All replays are equally long; the prices are `costs`.
+    It has the mean cost with an interval, the expected cost (with half an error added to each share
+    of wrong decisions), the shares of parts that were checked, accepted and rejected, and the
+    shares of wrong decisions (bad parts among the accepted ones, good parts among the rejected
+    ones). All replays are equally long; the prices are `costs`.
     """
     n = len(replays)
     verified, accepted, rejected = (
@@ -827,14 +852,13 @@ def _order_error(means: Floats) -> float:
 def _difference(
     first: Sequence[Replay], other: Sequence[Replay], costs: Costs
 ) -> tuple[float, float]:
-    """Return how much dearer a part is in the replays `first` than in `other`, and the standard
-    error of this difference.
+    """Return how much dearer a part is in `first` than in `other`, with the standard error.
 
-    The first value is a mean over all parts, in the unit of `costs`; it is negative if `first` is
-    cheaper. The replays are those of two policies, which have played the same shuffles in the same
-    order. The standard error adds the variance between parts, whose differences (less their mean)
-    are summed over the shuffles first, and the variance between shuffles, which is 0 for a single
-    shuffle.
+    The result is (difference, standard error). The difference is a mean over all parts, in the unit
+    of `costs`; it is negative if `first` is cheaper. The replays are those of two policies, which
+    have played the same shuffles in the same order. The standard error adds the variance between
+    parts, whose differences (less their mean) are summed over the shuffles first, and the variance
+    between shuffles, which is 0 for a single shuffle.
     """
     differences = np.array(
         [

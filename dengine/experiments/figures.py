@@ -86,10 +86,9 @@ def blank(width: float, height: float, title: str = "") -> Figure:
 
 
 def finish(axes: Axes, legend: int = 3, **settings: Any) -> None:
-    """Give axes a light grid, no lines at the top and the right, and a legend above them, where it
-    hides no curve.
+    """Give axes a light grid, no lines at the top and the right, and a legend above them.
 
-    Returns nothing; the axes are changed.
+    The legend hides no curve there. Returns nothing; the axes are changed.
 
     Parameters
     ----------
@@ -148,14 +147,15 @@ def embedding_map(replay: Replay, title: str = "") -> Figure:
     """Draw the embeddings of a replay's newest 300 parts, and return the figure.
 
     The left panel shows which parts were good and bad, the right one what was decided. A point is
-    the mean over the embedding spaces of the folds, in its first two dimensions (0 for a second one
-    that is missing), as it was at the decision; later retrains do not move it. Parts that no model
-    embedded, or whose embedding has another number of dimensions than the replay's newest, are left
-    out, on the left also parts of unknown truth. A circle with the recipe's radius is the
-    neighbourhood of the newest point. Without any point a text says so. If the recipe's reducer
-    gives an embedding that is never scaled (`has_own_unit`), its first dimension is taken for a
-    probability, and the second says little: the vertical axis is then the cycle, and two vertical
-    lines bound the neighbourhood. Raises SettingError if the reducer's class cannot be imported.
+    the mean over the embedding spaces (one for each fold of the cross-fitting), in its first two
+    dimensions (0 for a second one that is missing), as it was at the decision; later retrains do
+    not move it. Parts that no model embedded, or whose embedding has another number of dimensions
+    than the replay's newest, are left out, on the left also parts of unknown truth. A circle with
+    the recipe's radius, within which labels are counted, surrounds the newest point. Without any
+    point a text says so. If the recipe's reducer gives an embedding that is never scaled
+    (`has_own_unit`), its first dimension is taken for a probability, and the second says little:
+    the vertical axis is then the cycle, and two vertical lines take the place of the circle. Raises
+    SettingError if the reducer's class cannot be imported.
 
     Parameters
     ----------
@@ -213,8 +213,8 @@ def embedding_map(replay: Replay, title: str = "") -> Figure:
 def _draw_neighbourhood(figure: Figure, centre: Floats, radius: float, is_strip: bool) -> None:
     """Draw a point as a cross, with its neighbourhood, into all axes of a figure; add a legend.
 
-    `centre` (2,) is the point, and `radius` the radius of its neighbourhood, which is a circle, or
-    a strip between two vertical lines if `is_strip`.
+    `centre` (2,) is the point, and `radius` the distance within which labels are counted. The
+    neighbourhood is a circle, or a strip between two vertical lines if `is_strip`.
     """
     from matplotlib.patches import Circle
 
@@ -237,15 +237,15 @@ def _draw_neighbourhood(figure: Figure, centre: Floats, radius: float, is_strip:
 
 
 def window_curves(replays: Sequence[Replay], window: int = WINDOW, fewest: int = 1) -> pd.DataFrame:
-    """Compute the paper's curves over a sliding window of cycles.
+    """Compute the paper's curves, shares of decisions and of errors, over a window of cycles.
 
     Parameters
     ----------
     replays : sequence of Replay
         At least one; all equally long.
     window : int, default 300
-        Cycles in a window. At the first cycles, before there are so many, a window has all cycles
-        so far.
+        Cycles, one part each, in the sliding window. At the first cycles, before there are so many,
+        a window has all cycles so far.
     fewest : int, default 1
         precision and false_positive are NaN if the windows of all replays together have fewer
         accepted parts than this, or none; false_negative likewise for rejected parts.
@@ -300,11 +300,12 @@ def curves(by_recipe: Mapping[str, Sequence[Replay]], title: str = "") -> Figure
 
     The panels show, from the top: the share of certain decisions, those without a check, and its
     spread over the replays; the share of good parts among the accepted parts, and the lower bound
-    LB of each policy; bad parts among the accepted parts (solid), good parts among the rejected
-    parts (dashed), and the tolerances 100 - LB, all in percent. The legend below has the counts of
-    wrong decisions. A part of unknown truth counts as rightly decided. Shares of fewer than 20
-    accepted or rejected parts are not drawn; the share of certain decisions is drawn from the first
-    cycle. The window is 300 cycles, or a third of the longest replay if that is less.
+    LB of each policy (the success probability that accepted parts must have); bad parts among the
+    accepted parts (solid), good parts among the rejected parts (dashed), and the tolerances 100 -
+    LB, all in percent. The legend below has the counts of wrong decisions. A part of unknown truth
+    counts as rightly decided. Shares of fewer than 20 accepted or rejected parts are not drawn; the
+    share of certain decisions is drawn from the first cycle. The window is 300 cycles, or a third
+    of the longest replay if that is less.
 
     Parameters
     ----------
@@ -442,10 +443,10 @@ def cost_picture(curve: CostCurve, unit: str = "s") -> Figure:
 
 
 def _axis_labels(spec: TraceSpec) -> list[str]:
-    """Return a label for the axis of each channel of traces with this `TraceSpec`: its name, and
-    its unit in brackets if known.
+    """Return a label for the axis of each channel: its name, and its unit in brackets if known.
 
-    A single channel without a name is called "trace", several are "channel 0" and so on.
+    `spec` says what the traces look like. A single channel without a name is called "trace",
+    several are "channel 0" and so on.
     """
     names = spec.names if spec.columns or spec.channels > 1 else ["trace"]
     return [
@@ -465,12 +466,13 @@ def _times(spec: TraceSpec, samples: int) -> tuple[Floats, str]:
 def explained_picture(explanation: Explanation) -> Figure:
     """Draw the trace of a decision with its neighbours and the envelope; return the figure.
 
-    The envelope is the band in which 95 % of the successes lie at each sample. Samples that are
-    outside by more than a tenth of its width are shaded, but not one that stands alone. The picture
-    has a panel for each of at most four channels, in their order: those with the most samples so
-    far outside (those that stand alone count, too), of equal ones the first. Without an envelope
-    only the traces are drawn, of the first four channels. The title has the decision's id, action
-    and reason, the version and the label.
+    The neighbours are the labelled traces nearest to it in the embedding. The envelope is the band
+    in which 95 % of the traces of good parts lie at each sample. Samples that are outside by more
+    than a tenth of its width are shaded, but not one that stands alone. The picture has a panel for
+    each of at most four channels, in their order: those with the most samples so far outside (those
+    that stand alone count, too), of equal ones the first. Without an envelope only the traces are
+    drawn, of the first four channels. The title has the decision's id, action and reason, the
+    model's version and the label.
     """
     stored = explanation.decision
     decision = stored.decision
@@ -516,8 +518,9 @@ def explained_picture(explanation: Explanation) -> Figure:
 def _draw_neighbours(axes: Axes, x: Floats, explanation: Explanation, channel: int) -> None:
     """Draw one channel of the traces of a decision's neighbours, good and bad ones in two styles.
 
-    `x` (T,) are the times of the samples. Neighbours whose trace is not stored are left out. The
-    legend counts those that are drawn, of each label.
+    The neighbours are the labelled traces nearest to the decision's trace in the embedding. `x`
+    (T,) are the times of the samples. Neighbours whose trace is not stored are left out. The legend
+    counts those that are drawn, of each label.
     """
     for success, name, colour, line, _ in LABEL_STYLES:
         traces = [
@@ -558,7 +561,8 @@ def data_picture(data: Dataset, title: str = "") -> Figure:
     parts, and where the middle 80 % lie. Below are the share of good parts in a sliding tenth of
     the set, and among all, and the mean of each trace's first channel, in the order of the set.
     Traces with a sample that is not finite are not drawn; their labels count in the share. The
-    title is `title`, a colon and what is drawn. Raises what `data.spec` raises.
+    title is `title`, a colon and what is drawn. Raises SettingError if a field of the data set has
+    a value that no trace can have (`data.spec`).
     """
     X = data.cube
     finite: NDArray[np.bool_] = np.asarray(np.isfinite(X).all(axis=(1, 2)))
@@ -580,13 +584,13 @@ def data_picture(data: Dataset, title: str = "") -> Figure:
 
 
 def _draw_drift(figure: Any, data: Dataset, finite: NDArray[np.bool_], label: str) -> None:
-    """Draw into `figure` the share of good parts in a sliding tenth of a data set, and the mean of
-    each finite trace.
+    """Draw how a data set changes in its order: the share of good parts, the mean of each trace.
 
-    The share begins at the end of the first tenth; a dotted line is the share in the whole set. A
-    tenth is at least one part. The mean is taken over the samples of the first channel, and its dot
-    has the colour of the part's label; `label` names this channel and its unit. `figure` is a
-    Figure or SubFigure, and `finite` (n,) says which of the n traces have only finite samples.
+    `figure` is a Figure or SubFigure, which gets two axes. The upper one shows the share of good
+    parts in a sliding tenth of the data set (at least one part); it begins at the end of the first
+    tenth, and a dotted line is the share in the whole set. The lower one has a dot for each of the
+    n traces that has only finite samples, as `finite` (n,) says: the mean over the samples of the
+    first channel, in the colour of the part's label. `label` names this channel and its unit.
     """
     import pandas as pd
 

@@ -95,11 +95,11 @@ class KeptReplays:
     def path(self, task: Task) -> Path:
         """Return the path of the file of a task's replay in the folder, whether or not it exists.
 
-        The name of the file is a hash of what the decisions depend on: data, settings, seed, the
-        versions of Python and of `LIBRARIES`, the source code of dengine, and the files that define
-        the reducer's classes and functions. Other files of the user's are not in it, for example
-        one with a base class, a decision rule or a baseline. A reducer that is a `module:Class` is
-        imported.
+        A task is a replay to be played. The name of the file is a hash of what the decisions depend
+        on: data, settings, seed, the versions of Python and of `LIBRARIES` (those that compute,
+        like torch), the source code of dengine, and the files that define the reducer's classes and
+        functions. Other files of the user's are not in it, for example one with a base class, a
+        decision rule or a baseline. A reducer that is a `module:Class` is imported.
 
         Raises
         ------
@@ -136,11 +136,12 @@ class KeptReplays:
         return self.folder / f"{name}.npz"
 
     def get(self, task: Task) -> Replay | None:
-        """Read the replay of a task from the folder and return it; None if there is none, or if its
-        file is damaged or cannot be read.
+        """Read the replay of a task from the folder and return it; None if there is none.
 
-        The replay gets the name and recipe of the task's contender, who played it. Raises
-        SettingError as `path` does.
+        None is also returned if its file is damaged or cannot be read. A task is a replay to be
+        played. The replay gets the name and recipe of the task's contender, who plays it (dengine
+        with a recipe, or a baseline). Raises SettingError as `path` does, for example for a reducer
+        that cannot be hashed.
         """
         path = self.path(task)
         try:
@@ -161,9 +162,10 @@ class KeptReplays:
     def put(self, task: Task, replay: Replay) -> None:
         """Write the finished replay of a task into the folder, replacing an earlier file of it.
 
-        The file is compressed, and is written as a whole or not at all. Name and recipe are not
-        written, since `get` takes them from the task. Raises OutputError if the file cannot be
-        written, and SettingError as `path` does.
+        A task is a replay to be played. The file is compressed, and is written as a whole or not at
+        all. The name and the recipe of the replay are not written, since `get` takes them from the
+        task. Raises OutputError if the file cannot be written, and SettingError as `path` does, for
+        example for a reducer that cannot be hashed.
         """
         values: dict[str, Any] = {name: getattr(replay, name) for name in KEPT_VALUES}
         values["retrains"] = [asdict(report) for report in replay.retrains]
@@ -177,10 +179,11 @@ class KeptReplays:
 
 @cache
 def _digest_of_source() -> str:
-    """Return a hash, as hexadecimal text, of dengine's Python files and of the versions of Python
-    (only its first two numbers) and of the `LIBRARIES`.
+    """Return a hash of dengine's Python files and of library versions, as hexadecimal text.
 
-    It is computed once in a process. Libraries that are not installed are left out.
+    The versions are those of Python (only its first two numbers) and of `LIBRARIES`, those that
+    compute, like numpy and torch; libraries that are not installed are left out. The hash is
+    computed once in a process.
     """
     versions = {
         distribution.metadata["Name"]: distribution.version
@@ -206,11 +209,11 @@ def _source_of(class_or_function: Any) -> str:
 
 
 def _classes_and_functions(reducer: Any) -> list[Any]:
-    """Return the classes and functions whose code a scikit-learn transformer (`reducer`) runs,
-    without repeats.
+    """Return the classes and functions whose code a scikit-learn transformer runs, without repeats.
 
-    These are its class, the classes of the estimators among its parameters (all objects with a
-    method `fit`, also those nested in others), and the functions among its parameters.
+    These are the class of `reducer`, the transformer, the classes of the estimators among its
+    parameters (all objects with a method `fit`, also those nested in others), and the functions
+    among its parameters.
     """
     params = reducer.get_params(deep=True).values()
     estimators = [reducer, *(param for param in params if hasattr(param, "fit"))]
@@ -221,8 +224,9 @@ def _classes_and_functions(reducer: Any) -> list[Any]:
 def load_contenders(recipes: Sequence[Any]) -> list[Contender]:
     """Return a list of contenders, each loaded from anything that `Contender.load` takes.
 
-    A contender, who plays a stream, is a recipe or a baseline with a name. If `recipes` is one
-    text, it gives one contender.
+    A contender plays a stream of parts: it is dengine with a recipe (all settings of an engine), or
+    a baseline (a method to compare with), under a name. If `recipes` is one text, it gives one
+    contender.
 
     Raises
     ------
@@ -281,6 +285,7 @@ def iterate_replays(
     dataset : object
         Anything `load_dataset` takes.
     tasks : sequence of Task
+        Each with its contender (dengine with a recipe, or a baseline), seed and number of cycles.
     n_jobs : int, default 1
         Replays at a time, as joblib counts them. Timings are right with 1 alone. 1 plays in this
         thread, which then has one torch thread.
@@ -296,6 +301,7 @@ def iterate_replays(
     Yields
     ------
     played : PlayedReplay
+        The replay, the position of its task among `tasks`, and whether it was read from `keep`.
 
     Raises
     ------
@@ -420,7 +426,7 @@ def grid_tasks(
     Parameters
     ----------
     recipes : str or sequence
-        As `load_contenders` takes them.
+        Recipes or names of baselines (methods to compare with), as `load_contenders` takes them.
     alphas, lower_bounds, intervals : sequence
         Settings of the policy; None leaves one to the recipe.
     seeds : iterable of int
@@ -432,7 +438,8 @@ def grid_tasks(
     Returns
     -------
     tasks : list of Task
-        By contender, interval, alpha, lower bound and seed.
+        Ordered by contender (a recipe or baseline as loaded), interval, alpha, lower bound and
+        seed.
 
     Raises
     ------

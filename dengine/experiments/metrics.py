@@ -51,7 +51,8 @@ class ErrorRate:
 def pooled_error(replays: Sequence[Any], side: str = "accepted", alpha: float = 0.05) -> ErrorRate:
     """Compute the share of wrong decisions over many replays of one data set.
 
-    Thirty shuffles of one set play the same traces thirty times, so they are not thirty independent
+    An accepted part that was bad, and a rejected part that was good, are wrong decisions. Thirty
+    shuffles of one set play the same traces thirty times, so they are not thirty independent
     samples. The unit is therefore the trace: the variance of the share is estimated from the
     differences between traces, by linearisation (the error of a ratio of two sums, to first order).
     The interval is Wilson's, for the number of independent decisions that would have this variance.
@@ -62,8 +63,8 @@ def pooled_error(replays: Sequence[Any], side: str = "accepted", alpha: float = 
     Parameters
     ----------
     replays : sequence of Replay
-        All of one data set; may be empty. No replay may be of a live run, which does not record
-        which traces it had.
+        All of one data set; may be empty. No replay may be of a live run on a robot cell, which
+        does not record which traces it had.
     side : {"accepted", "rejected"}, default "accepted"
         Which decisions are judged.
     alpha : float, default 0.05

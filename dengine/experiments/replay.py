@@ -100,7 +100,10 @@ class Contender:
 
     @classmethod
     def load(cls, recipe: Any) -> "Contender":
-        """Return the contender, who plays a stream, for a recipe or for a baseline's name.
+        """Return the contender, who plays a stream of parts, for a recipe or for a baseline's name.
+
+        It is dengine with a recipe (all settings of an engine), or a baseline (a method to compare
+        with).
 
         Parameters
         ----------
@@ -114,7 +117,7 @@ class Contender:
         Raises
         ------
         SettingError
-            Anything else.
+            For anything else, and for a file of a recipe that cannot be read.
         """
         if isinstance(recipe, Contender):
             return recipe
@@ -135,12 +138,12 @@ class Contender:
         return replace(self, recipe=self.recipe.with_policy(**changes))
 
     def engine(self, seed: int, trace: TraceSpec | None = None) -> DataEngine:
-        """Return a new engine with a store in memory; its model is the baseline if the contender is
-        one.
+        """Return a new engine, with its store in memory, for this contender's recipe or baseline.
 
-        `trace` is the `TraceSpec` of the traces; None: the first trace sets it. A training ends
-        after a number of steps and not by the time budget, so that the same seed gives the same
-        decisions. It limits this thread to one torch thread. Raises SettingError for settings that
+        A baseline is a method to compare with; it is the model of the engine. `trace` is the shape,
+        rate and units of the traces; None: the first trace sets it. A training ends after a number
+        of steps and not by the time budget, so that the same seed gives the same decisions. The
+        call limits this thread to one torch thread. Raises SettingError for settings that
         `DataEngine` refuses, such as force limits in seconds at an unknown rate, and for a baseline
         that cannot be made.
         """
@@ -317,9 +320,10 @@ class Replay:
         counts : dict
             first_cycle and last_cycle, counted from 1. verified_share, NaN without cycles. Numbers
             of cycles: verified, accepted, rejected (by the model), false_positive (accepted and
-            known to be bad), false_negative (rejected and known to be good), novel (verified as
-            novel), safe_mode (after which every part is verified), outside (the trace left the
-            force limits), and stops, the line stops.
+            known to be bad), false_negative (rejected and known to be good), novel (verified
+            because the trace is unlike all learned ones), safe_mode (after which every part is
+            verified, because of an alarm), outside (the trace left an operator's force limits), and
+            stops (an accepted part was bad and stopped the line).
         """
         begin, end, _ = cycles.indices(len(self))
         counts = {name: int(getattr(self, name)[cycles].sum()) for name in COUNTED}
@@ -345,17 +349,20 @@ class Replay:
         Returns
         -------
         row : dict
-            The settings: recipe, interval, alpha, lower_bound, guarantee, stops, confirm, seed.
-            The numbers of cycles of `stretch` but verified and stops; cycles; certain, the number
-            of parts that the model accepted or rejected; first_certain, the cycle of the first of
-            them, counted from 1. precision and npv, the shares of right decisions among the
-            accepted and the rejected parts, and accuracy, among both. retrains, their number;
-            retrains_dropped, the number of those that were dropped; dropped, the reason of the last
-            of these, or "". retrain_p50_s and retrain_max_s, the median and largest time of a
-            retrain; decide_p50_us and decide_p99_us, the median and 99th percentile of a
-            decision's, in µs; seconds, those of the replay. saved_s, the seconds of checks that
-            the certain parts saved; and net_s, which is saved_s minus the cost of errors, in
-            seconds, by the defaults of `Costs`.
+            The settings: recipe, interval, alpha, lower_bound, guarantee, stops, confirm (whether
+            the cell confirmed accepted good parts), seed. cycles, their number. Numbers of cycles:
+            accepted, rejected (by the model), false_positive (accepted and bad), false_negative
+            (rejected and good), novel (verified because the trace is unlike all learned ones),
+            safe_mode (after which every part is verified, because of an alarm), outside (the trace
+            left an operator's force limits). certain, the number of parts that the model accepted
+            or rejected; first_certain, the cycle of the first of them, counted from 1. precision
+            and npv, the shares of right decisions among the accepted and the rejected parts, and
+            accuracy, among both. retrains, their number; retrains_dropped, the number of those
+            whose model was not put in use; dropped, the reason of the last of these, or "".
+            retrain_p50_s and retrain_max_s, the median and largest time of a retrain; decide_p50_us
+            and decide_p99_us, the median and 99th percentile of a decision's, in µs; seconds, those
+            of the replay. saved_s, the seconds of checks that the certain parts saved; and net_s,
+            which is saved_s minus the cost of errors, in seconds, by the defaults of `Costs`.
 
         Raises
         ------
@@ -422,9 +429,10 @@ def observe_cycles(engine: DataEngine, cell: Cell, cycles: int) -> Iterator[Obse
 def to_replay(observed: Sequence[ObservedCycle], recipe: Recipe) -> Replay:
     """Return observed cycles, in their order, as a `Replay`; it is empty if there are none.
 
-    `recipe` is the recipe of the engine that drove the robot cell. The fields that only a replay of
-    a recorded data set has (`index`, `dataset`, `seed`, `confirm`, `seconds`) keep their defaults.
-    `name` is the recipe's name, and `retrains` has the reports that the cycles carry.
+    `observed` has pairs of a cycle (one part) and whether the part was good: 1.0, 0.0, or NaN if
+    unknown. `recipe` is the recipe of the engine that drove the robot cell. The fields that only a
+    replay of a recorded data set has (`index`, `dataset`, `seed`, `confirm`, `seconds`) keep their
+    defaults. `name` is the recipe's name, and `retrains` has the reports that the cycles carry.
     """
     cycles = [cycle for cycle, _ in observed]
     decisions = [cycle.decision for cycle in cycles]
@@ -449,9 +457,9 @@ def to_replay(observed: Sequence[ObservedCycle], recipe: Recipe) -> Replay:
 def _positions(decisions: list[Decision]) -> Floats:
     """Return the embedding of each of n decisions, the mean over the embedding spaces, (n, d).
 
-    d is the dimension of the newest embedding, or 2 if there is none. A reducer may give more
-    dimensions as it sees more traces; a decision whose embedding has another dimension, or that has
-    none, has a row of NaN.
+    A decision has one point in each embedding space. d is the dimension of the newest embedding, or
+    2 if there is none. A reducer may give more dimensions as it sees more traces; a decision whose
+    embedding has another dimension, or that has none, has a row of NaN.
     """
     means = [
         np.mean(decision.embedding, axis=0) if decision.embedding else np.empty(0)
@@ -471,6 +479,9 @@ def watch(
 ) -> Replay:
     """Let an engine drive a robot cell, and return the run as a `Replay`.
 
+    In each cycle the cell inserts a part, the engine decides, and the outcome is reported, from
+    which the engine learns.
+
     Parameters
     ----------
     engine : DataEngine
@@ -483,9 +494,9 @@ def watch(
     Returns
     -------
     run : Replay
-        The run of all `cycles`. An exception of the engine (as of `DataEngine.run`), of the cell or
-        of `on_cycle` goes on to the caller; then nothing is returned, and only `on_cycle` has got
-        the cycles before the exception.
+        The record of all `cycles`. An exception of the engine (as of `DataEngine.run`), of the cell
+        or of `on_cycle` goes on to the caller; then nothing is returned, and only `on_cycle` has
+        got the cycles before the exception.
     """
     observed = []
     for item in observe_cycles(engine, cell, cycles):
@@ -517,36 +528,39 @@ def replay(
     dataset : object
         Anything `load_dataset` takes.
     recipe : object
-        Anything `Recipe.load` takes, the name of a baseline (`experiments.baselines.BASELINES`), a
-        `Contender`, or, for a model of your own, a fresh engine. Afterwards this engine holds what
-        it learned.
+        Anything `Recipe.load` takes, the name of a baseline (a method to compare with, in
+        `experiments.baselines.BASELINES`), a `Contender`, or, for a model of your own, a fresh
+        engine. Afterwards this engine holds what it learned.
     seed : int, default 0
         Of the shuffle, and of the engine unless one is given; the same seed gives the same
         decisions, but not with an engine of yours whose trainings end by a time budget.
     cycles : int or None, default None
         Only the first so many parts, after the shuffle; None plays all.
     alpha, lower_bound : float or None, default None
-        Of the policy; None takes the recipe's, which are 0.05 and 0.95 by default.
+        Error level, and success probability that accepted parts must have; None takes the recipe's,
+        which are 0.05 and 0.95 by default.
     shuffle : bool, default True
         False plays the stream in its recorded order, drift included.
     confirm : bool, default False
-        Whether the robot cell confirms accepted good parts. By default only line stops are known.
-        With `Policy(stops="all")` the engine takes the absence of a line stop as a confirmation
-        anyway.
+        Whether the robot cell confirms accepted good parts. By default only line stops (bad
+        accepted parts) become known. With `Policy(stops="all")` the engine takes the absence of a
+        line stop as a confirmation anyway.
     on_cycle : callable or None, default None
         Called with the number of finished cycles, for a progress bar.
 
     Returns
     -------
     replay : Replay
+        The record of each cycle (one part), with the reports of the retrains.
 
     Raises
     ------
     SettingError
         A number of cycles that the data set does not have, anything that is no recipe, a reducer,
-        rule or baseline that cannot be made, alpha or lower_bound out of range or beside an engine,
-        a malformed `windows.trigger` of the data's description, or a policy with force limits in
-        seconds for a data set of an unknown rate.
+        decision rule or baseline that cannot be made, alpha or lower_bound out of range or beside
+        an engine, a malformed `windows.trigger` (where parts begin in a long recording) of the
+        data's description, or a recipe with an operator's force limits in seconds for a data set of
+        an unknown rate.
     DataError, ValueError
         A data set that cannot be read, see `load_dataset`.
     StoreError
@@ -592,18 +606,22 @@ def replay(
 def replay_policy(scores: Replay, policy: Policy) -> Replay:
     """Let a policy decide on the predictions that a replay in shadow mode recorded.
 
-    No model is asked. In shadow mode every part was verified, and the counts and embeddings of the
-    model were recorded. The rule of the policy decides on these. A rule whose bound only sorts
-    parts (`DecisionRule.sorts`), like those of "pooled" and "cost", takes the first axis of the
-    embedding, if the reducer predicts a probability there, and no counts. This probability is drawn
-    towards 1/2 while few parts have come (`fade`), if the rule has `prior_labels`. A rule learns
-    only outcomes that it would know in a replay of its own: checks, audits and line stops, and with
-    `stops="all"` also that an accepted part was good. Two differences to such a replay stay: the
-    predictions come from a model that has learned all labels, and the force limits are those of
-    `scores`; those of `policy` are not applied, since a replay has no traces. Audits are drawn
-    anew, by the seed of the replay. A part for which the model was not asked, such as a novel part
-    or one that left an operator's force limits, is verified; the rule learns its outcome, too, with
-    the bounds 0 and 1.
+    In shadow mode every part was verified, and the model's label counts and embeddings were
+    recorded. The decision rule, of which `policy` holds the settings, decides on these; no model is
+    asked. A rule whose bound only sorts parts (`DecisionRule.sorts`), like those of the guarantees
+    "pooled" and "cost", takes no counts if the reducer predicts a probability of success: it takes
+    this probability, the first axis of the embedding. If the rule has `prior_labels`, the
+    probability is drawn towards 1/2 while few parts have come (`fade`). A rule learns only outcomes
+    that it would know in a replay of its own: checks, audits (checks, drawn at random, of parts of
+    which it is certain) and line stops (bad accepted parts), and with `stops="all"` (every bad
+    accepted part is reported) also that an accepted part was good. Audits are drawn anew, by the
+    seed of the replay. A part for which the model was not asked, such as a novel part (unlike all
+    learned traces) or one that left an operator's force limits, is verified; the rule learns its
+    outcome, too, with the bounds 0 and 1.
+
+    Two differences to such a replay stay: the predictions come from a model that has learned all
+    labels, and the force limits are those of `scores`; those of `policy` are not applied, since a
+    replay has no traces.
 
     Parameters
     ----------

@@ -87,10 +87,10 @@ class Survey:
 def survey_dataset(data: Dataset) -> Survey:
     """Count the traces, labels, faults and repeats of a data set.
 
-    Repeats are counted among the usable traces, which are finite, not constant, and without a
-    sample beyond 1e18: those that equal an earlier one, and, of the newest 500, those that nearly
-    repeat the trace of another part (`near_repeats`). Nothing is trained, and the data set is not
-    changed.
+    Faults are recordings that could not be read. Repeats are counted among the usable traces, which
+    are finite, not constant, and without a sample beyond 1e18: those that equal an earlier one,
+    and, of the newest 500, those that nearly repeat the trace of another part (`near_repeats`).
+    Nothing is trained, and the data set is not changed.
 
     Parameters
     ----------

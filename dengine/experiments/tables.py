@@ -70,8 +70,9 @@ def frame_of(replays: Sequence[Replay], check_seconds: float = VERIFY_SECONDS) -
 def pool(frame: pd.DataFrame, replays: Sequence[Replay]) -> list[Row]:
     """Pool the replays that have the same settings, and return a row for each of these settings.
 
-    The settings are the columns in `CONDITION`, from the recipe to `stops`. There is a row for
-    each combination of their values that the frame has, in the frame's order.
+    The settings are the columns in `CONDITION`: recipe, interval, alpha, lower_bound, guarantee and
+    stops. There is a row for each combination of their values that the frame has, in the frame's
+    order.
 
     Parameters
     ----------
@@ -85,19 +86,22 @@ def pool(frame: pd.DataFrame, replays: Sequence[Replay]) -> list[Row]:
     rows : list of dict
         Beside `CONDITION`, `replays` (how many) and `cycles` (of all of them):
 
-        - certain, accepted, rejected, false_positive and the other `COUNTS`: means per replay.
-          `total_*`: their sums. `certain_sd` and `false_positive_sd`: standard deviations over the
-          replays, NaN for one replay.
+        - certain (accepted or rejected by the model), accepted, rejected, false_positive,
+          false_negative, novel (verified as unlike all learned traces) and safe_mode (after which
+          every part is verified, because of an alarm): mean number of cycles per replay. `total_*`:
+          their sums. `certain_sd` and `false_positive_sd`: standard deviations over the replays,
+          NaN for one replay.
         - precision, npv : computed from the sums over all replays; NaN without such decisions. A
           mean over the replays would weigh a replay that accepted three parts as much as one that
           accepted 300.
-        - Times of retrains and decisions, the first certain cycle and savings: median, largest or
-          mean, as `AGGREGATED` says. Replays without such a value (NaN) are left out.
+        - Times of retrains and decisions, the first cycle without a check (`first_certain`), and
+          the seconds of checks saved (`saved_s`, `net_s`): median, largest or mean, as `AGGREGATED`
+          says. Replays without such a value (NaN) are left out.
         - error_lower, error_upper : 95 % interval of the share of bad parts among the accepted
           parts; 0 and 1 if none was accepted.
         - promise_kept : whether the pooled precision is at least `lower_bound`; None if fewer than
           200 parts were accepted.
-        - retrains_dropped : number of retrains whose version was not put in force.
+        - retrains_dropped : number of retrains whose model was not put in use.
     """
     rows = []
     for key, part in frame.reset_index(drop=True).groupby(CONDITION, sort=False):
@@ -126,14 +130,14 @@ def _share_right(n_wrong: int, n_decided: int) -> float:
 
 
 def promise_lines(rows: Sequence[Row]) -> list[str]:
-    """Return a sentence for each row that `pool` returned: were at least LB of its accepted parts
-    good?
+    """Return a sentence for each row of `pool`: were at least LB of its accepted parts good?
 
-    A row has replays with the same settings, counted together. LB is the lower bound of its policy.
-    The sentence ends with "kept" or "broken", or says that no part, or too few parts, were
-    accepted. It always names the recipe and the guarantee. It names the interval and alpha only if
-    the rows differ in it. Unless no part was accepted, it has the share of good parts among the
-    accepted parts, the interval of the share of bad parts, and LB.
+    A row has replays with the same settings, counted together. LB is the `lower_bound` of its
+    policy, the success probability that accepted parts must have. The sentence ends with "kept" or
+    "broken", or says that no part, or too few parts, were accepted. It always names the recipe and
+    the guarantee (the rule that decided). It names the interval and alpha only if the rows differ
+    in it. Unless no part was accepted, it has the share of good parts among the accepted parts, the
+    interval of the share of bad parts, and LB.
     """
     varying = [name for name in ("interval", "alpha") if len({row[name] for row in rows}) > 1]
     lines = []
@@ -158,8 +162,9 @@ def pooled_table(rows: Sequence[Row], title: str, legend: str) -> Table:
     """Return the rows that `pool` returned as a rich Table for the screen, with a legend below.
 
     There must be at least one row. The first column has the recipe, the guarantee, the policy's
-    `stops`, and the interval if the rows differ in it. The others are those of `CELLS`: counts,
-    shares, times and savings.
+    `stops`, and the interval if the rows differ in it. The others are those of `CELLS`: alpha and
+    lower bound, counts and shares of decisions and errors, times of retrains and decisions, and
+    seconds of checks saved.
     """
     several_intervals = len({row["interval"] for row in rows}) > 1
     shown = []
@@ -182,8 +187,8 @@ def table_of_numbers(
     title, caption : str
         Texts above and below the table.
     rows : sequence of mappings
-        A mapping for each row, at least one: column title -> robot cell, with the same titles in
-        the same order in all. The first column has the names of the rows.
+        A mapping for each row, at least one: column title -> text of the table's cell, with the
+        same titles in the same order in all. The first column has the names of the rows.
     total : bool, default False
         Draw a line above the last row.
     """
@@ -243,11 +248,10 @@ CELLS: dict[str, Any] = {
 
 
 def retrain_line(retrains: Sequence[RetrainReport]) -> str:
-    """Return a sentence: how many retrains there were, the seconds of the slowest, and how many new
-    versions were dropped.
+    """Return a sentence on retrains: how many, how many seconds at most, how many were dropped.
 
-    If any was dropped, it gives the reason of the last one. If there was no retrain, it is "No
-    retrain."
+    A retrain is dropped if its new model is not put in use; the sentence gives the reason of the
+    last such retrain. If there was no retrain, it is "No retrain."
     """
     if not retrains:
         return "No retrain."

@@ -108,16 +108,18 @@ def prepare_export(
 ) -> tuple[Exportable, DecisionModule]:
     """Check that an engine or a model can be exported, and build its decision module.
 
-    No file is written; but for an engine traces are read, and each damaged one is noted as an event
-    in the store. The module shares references and decision rule with the model. Its decider is
-    compiled already; the module itself is not.
+    No file is written; but for an engine labelled traces are read, and each damaged one is noted as
+    an event in the store. The module shares the references (embedded labelled traces, which it
+    counts near a new trace) and the decision rule with the model, so what one learns the other
+    knows. The decider in it, the module that decides on one trace, is compiled by TorchScript
+    already; the module itself is not.
 
     Parameters
     ----------
     engine_or_model : DataEngine or ModelPrediction
     trace : TraceSpec or None
-        The `TraceSpec` of the file, if it is not the engine's or the model's own. It must have the
-        shape of the model's traces.
+        The `TraceSpec` (shape, rate and units of the traces) of the file, if it is not the engine's
+        or the model's own. It must have the shape of the model's traces.
     path : path-like
         Where the file will be written.
     force : bool
@@ -126,18 +128,19 @@ def prepare_export(
     Returns
     -------
     source : Exportable
-        The model with its `TraceSpec`, audits and force limits.
+        The model with its `TraceSpec`, rate of audits (checks of parts that it is certain of) and
+        force limits of the operator.
     module : DecisionModule
         Decides on traces and learns their outcomes; the content of a TorchScript file.
 
     Raises
     ------
     ExportError
-        For a baseline; before the first training; for a `trace` of another shape; for a rule, an
-        interval or a reducer that TorchScript cannot compile or run; if the compiled decision and
-        the reducer map one of up to eight labelled traces to different points (`compare_points`);
-        if the rule is stale, because an update of it failed; and if the store was changed from
-        outside.
+        For a baseline (a model that the user handed in); before the first training; for a `trace`
+        of another shape; for a rule, an interval or a reducer that TorchScript cannot compile or
+        run; if the compiled decision and the reducer map one of up to eight labelled traces to
+        different points (`compare_points`); if the rule is stale, because an update of it failed;
+        and if the store was changed from outside.
     SettingError
         If the engine's force limits do not fit `trace`.
     OutputError
@@ -182,13 +185,15 @@ def prepare_export(
 def exportable(engine_or_model: Any, trace: TraceSpec | None = None) -> Exportable:
     """Return the model that decides at present, with the engine's settings, for an exporter.
 
-    `engine_or_model` is a `DataEngine` or a `ModelPrediction`. Of an engine the result has the
-    audits, the seed, the force limits, the version, the recipe, eight labelled traces, and a
+    `engine_or_model` is a `DataEngine` or a `ModelPrediction`. Of an engine the result has the rate
+    of audits (checks of parts that the model is certain of), the seed of their draw, the operator's
+    force limits, the version, the recipe (all settings), up to eight labelled traces, and a
     function that records events; of a model alone, which has none of these, it has some of the
     traces it was trained on. The model is not copied, and goes on learning. `trace` replaces the
-    `TraceSpec` of the engine or the model. Raises ExportError before the first training, for a
-    baseline, and if the engine's store was changed from outside; StoreError if it cannot be read. A
-    damaged trace is left out, and noted as an event in the store.
+    `TraceSpec` (shape, rate and units of the traces) of the engine or the model. Raises ExportError
+    before the first training, for a baseline (a model that the user handed in), and if the engine's
+    store was changed from outside; StoreError if it cannot be read. A damaged trace is left out,
+    and noted as an event in the store.
     """
     engine = engine_or_model if isinstance(engine_or_model, DataEngine) else None
     model = engine_or_model if engine is None else engine.model
@@ -223,11 +228,13 @@ def describe(source: Exportable) -> Metadata:
     """Return the description that is written into the file, as a dict for JSON.
 
     `source` is what the file is made from. The dict has the schema (the version of its keys), the
-    versions of dengine, torch and the model, the time, the `TraceSpec`, the policy (with a user's
-    rule as `module:Class`), the limit of novelty, the numbers of embedding spaces and of
-    coordinates, the references (labelled points: their number, their largest number and their
-    SHA-256), the order of the fields of a decision, of actions, reasons and safe modes, the audit
-    rate, the seed and the recipe. `metadata_of` reads it without loading the model.
+    versions of dengine, torch and the model, the time, the `TraceSpec` (shape, rate and units of
+    the traces), the policy (with a user's rule as `module:Class`), the factor of the limit beyond
+    which a trace counts as novel, the numbers of embedding spaces and of coordinates, the
+    references (labelled points: their number, their largest number and their SHA-256), the order of
+    the fields of a decision, of actions, reasons and safe modes, the audit rate (share of parts
+    that are checked although the model is certain), the seed and the recipe (all settings).
+    `metadata_of` reads it without loading the model.
     """
     model = source.model
     index = model.index

@@ -92,9 +92,10 @@ class CellJournal:
 def read_journal(path: FilePath, spec: TraceSpec) -> CellJournal:
     """Read and check the journal that the program of an exported model wrote in a robot cell.
 
-    Parts without a label are left out unless they were accepted. If the label of an accepted part
-    came after the next part was decided, the result has two lines for it: one without a label, and
-    later one with it (`late`). A last line that was not finished is left out, see `cut`.
+    The journal has a line for each part and each later label. Parts without a label are left out
+    unless they were accepted. If the label of an accepted part came after the next part was
+    decided, the result has two lines for it: one without a label, and later one with it (`late`). A
+    last line that was not finished is left out; `cut` of the result is its length in bytes.
 
     The first line whose checksum does not fit, and all lines after it, are set aside without an
     error, and `set_aside` of the result says so (or the DataError, if nothing of use is left). If
@@ -111,6 +112,8 @@ def read_journal(path: FilePath, spec: TraceSpec) -> CellJournal:
     Returns
     -------
     CellJournal
+        Its `lines` are the accepted and the labelled parts, in the order in which their outcomes
+        became known.
 
     Raises
     ------
@@ -237,17 +240,19 @@ def _parse_part(words: list[str], spec: TraceSpec) -> JournalLine:
 
 
 def import_journal(store: "StoreLike", path: FilePath, any_model: bool = False) -> ImportReport:
-    """Import what an exported robot cell learned into the store of its engine.
+    """Import the journal of a robot cell that ran an exported model into the store of its engine.
 
-    A part that was imported before is not imported again, but its label is, if it has none yet; a
-    label that contradicts the stored one is only counted. A part whose trace has a fault is
-    quarantined. New rows have the time of the import. The decision rule and the certificate count
-    imported parts like the engine's own. Propensities and `stops` are those of the policy that the
-    store has now. Under `stops="all"` an accepted part without a report is imported as good, unless
-    it is the journal's last part; under "some" it is imported without a label. Other parts without
-    a label are left out. If a line is missing or was changed, only the lines before it are
-    imported. A store that was passed open stays open; on PostgreSQL it owns the cell until it is
-    closed.
+    The journal is the file in which the exported program wrote its parts. A part that was imported
+    before is not imported again, but its label is, if it has none yet; a label that contradicts the
+    stored one is only counted. A part whose trace has a fault is stored, but never used in
+    training. New rows have the time of the import. The decision rule, and the certificate (a bound
+    on the share of bad accepted parts), count imported parts like the engine's own. The policy that
+    the store has now gives each part its propensity (the probability of a check), and `stops`.
+    Under `stops="all"` (every bad accepted part is reported) an accepted part without a report is
+    imported as good, unless it is the journal's last part; under "some" it is imported without a
+    label. Other parts without a label are left out. If a line is missing or was changed, only the
+    lines before it are imported. A store that was passed open stays open; on PostgreSQL it owns the
+    cell until it is closed.
 
     Parameters
     ----------
@@ -256,8 +261,8 @@ def import_journal(store: "StoreLike", path: FilePath, any_model: bool = False) 
     path : path-like
         The journal.
     any_model : bool, default False
-        Whether to take a journal of a model whose export is no event of this store. A store without
-        any export event takes every journal.
+        Whether to take a journal of a model whose export this store has not recorded as an event. A
+        store without any export event takes every journal.
 
     Returns
     -------
@@ -310,10 +315,11 @@ def import_journal(store: "StoreLike", path: FilePath, any_model: bool = False) 
 def _with_known_outcomes(journal: CellJournal, stops: str) -> list[JournalLine]:
     """Return the lines of a journal, with the labels of accepted parts that were not reported.
 
-    If `stops` is "some", the lines are returned as they are. If it is "all", an accepted part
-    without a label gets the label good, because the next part was decided; the pending part at the
-    end is left out. An accepted part whose label came late has two lines, and only one is returned:
-    the late line if it says bad, else the first line, with the label good.
+    If `stops` is "some" (not every bad accepted part is reported), the lines are returned as they
+    are. If it is "all", an accepted part without a label gets the label good, because the next part
+    was decided; the last part, if its outcome is not known yet (`journal.pending`), is left out. An
+    accepted part whose label came late has two lines, and only one is returned: the late line if it
+    says bad, else the first line, with the label good.
     """
     if stops == "some":
         return journal.lines

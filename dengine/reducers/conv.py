@@ -85,12 +85,15 @@ class ConvNetwork(nn.Module):
         self.hidden_dropout = nn.Dropout(0.2)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Preprocessed traces (B, members * channels, L) -> features (B, members * features).
+        """Compute features (B, members * features) of traces (B, members * channels, L).
 
-        The module computes `members` separate networks at once. The outputs of their convolutions
-        are pooled to the mean and maximum of each region of the trace (early, middle, late) and of
-        the whole trace (whose mean is that of the means of the regions), and then pass the hidden
-        layer and a ReLU. In training mode dropout makes the result random.
+        The traces are preprocessed: averaged to L samples and standardised, with the differences in
+        time as further channels. The module computes `members` separate networks of the same form
+        at once, each on `channels` channels of its own. The outputs of the convolutions are pooled
+        to the mean and maximum of each region of the trace (early, middle, late) and of the whole
+        trace (whose mean is that of the means of the regions), and then pass the hidden layer and a
+        ReLU. In training mode dropout makes the result random, and the running statistics of batch
+        normalisation change.
         """
         h = self.convolutions(x)  # (B, members * C * 2 * width, P)
         mean = F.avg_pool1d(h, self.window, self.stride)  # (B, ..., regions)
@@ -215,12 +218,16 @@ class ConvReducer(TorchReducer):
         self.rocket_._initialize(traces)
 
     def _build(self, channels: int, samples: int, average: int, seed: int | None = None) -> None:
-        """Build `rocket_`, preprocessor and networks for traces of this shape.
+        """Build `rocket_`, preprocessor and networks anew for traces of this shape.
 
-        It does what `TorchReducer._build` does, after making `rocket_`, a `RocketReducer` that is
-        not initialised yet. The networks have initial weights. `average` is the number of samples
-        that are averaged to one. Without `seed` the seed of the networks comes from `random_state`.
-        Raises SettingError as `TorchReducer._build` does; `rocket_` has been replaced by then.
+        `rocket_` becomes a new `RocketReducer` (random convolution kernels under logistic
+        regressions), whose kernels are not drawn yet. Then `TorchReducer._build` makes the
+        preprocessor, and one copy of the network for each fold (a fixed group of traces), with
+        initial weights; it resets the counts of steps and the optimiser, and sets `is_initialized_`
+        to False. `average` is the number of samples that are averaged to one. Without `seed` the
+        seed of the networks comes from `random_state`. Raises SettingError for a parameter out of
+        its range, fewer than 2 samples, or a `random_state` of another type; `rocket_` has been
+        replaced by then.
         """
         # Before `encoder_`, by which other threads see that there is a module.
         self.rocket_ = RocketReducer(
@@ -253,10 +260,14 @@ class ConvReducer(TorchReducer):
         return average_logits(torch.from_numpy(points), torch.from_numpy(probabilities)).numpy()
 
     def embed(self, X: Floats) -> Floats:
-        """Embed traces (n, T) or (n, C, T) in every space; return float32 (n, K, d).
+        """Embed traces (n, T) or (n, C, T) in every embedding space; return float32 (n, K, d).
 
-        The logit of the first coordinate is the mean of those of the network and of `rocket_`.
-        Raises as `TorchReducer.embed` does.
+        There is a space for each of the K folds (fixed groups of traces); the models of space k
+        were trained without the labels of fold k. The first of the d coordinates is a probability
+        of success; its logit is the mean of the logits of the network and of `rocket_`, the
+        `RocketReducer` beside it. The second coordinate, if any, is the network's. Raises
+        NotFittedError before there are networks, and the errors of `check_traces`, such as
+        ValueError for traces of another shape.
         """
         traces = self.check_traces(X)  # once, since `rocket_` knows no names of columns
         return average_logits(
@@ -283,12 +294,13 @@ class ConvReducer(TorchReducer):
         }
 
     def set_state(self, state: Arrays) -> Self:
-        """Restore what `get_state` returned, `rocket_` included; return self.
+        """Restore what `get_state` returned, and return self.
 
-        The constructor's parameters must be the same. Raises StoreError if the state is of another
-        network, or of an older release, which stored no `rocket_`. Raises what
-        `TorchReducer.set_state` and `RocketReducer.set_state` raise. After an error do not use the
-        reducer.
+        `rocket_`, the `RocketReducer` beside the network, is restored, too. The constructor's
+        parameters must be the same. Raises StoreError if the state has no arrays of `rocket_`, as
+        in an older release, or if it is of another network or of other sizes; KeyError, ValueError
+        or StoreError if it lacks other arrays; and SettingError for a parameter out of its range.
+        After an error do not use the reducer.
         """
         rocket = arrays_with_prefix(state, "rocket.")
         if not rocket:  # stored when conv was its network alone

@@ -170,10 +170,12 @@ class Encoder(nn.Module):
 
     @torch.jit.export
     def embed(self, x: Tensor) -> Tensor:
-        """Preprocessed traces for each copy of the network (B, K, C', L) -> embedding (B, K, dim).
+        """Embed preprocessed traces by each copy of the network: (B, K, C', L) -> (B, K, dim).
 
-        The first coordinate is the probability of success. The second, if `dim` is 2, is 0.1 times
-        the difference between the two sigmoid units from which the copy computes the probability.
+        Each of the K copies embeds the traces at its own index k; a preprocessed trace has C'
+        channels of L averaged, standardised samples. The first coordinate is the copy's probability
+        of success. The second, if `dim` is 2, is 0.1 times the difference between the two sigmoid
+        units from which the copy computes the probability.
         """
         units = self.members.units(x)
         probability = self.members.logits(units).sigmoid()
@@ -186,10 +188,12 @@ class Encoder(nn.Module):
 def fold_batch_norms(module: nn.Module) -> nn.Module:
     """Fold the batch normalisations of each `FoldableSequential` of a module into convolutions.
 
-    Each is folded into the `Conv1d` right before it, by `fuse_conv_bn_eval`. Batch normalisations
-    without a `Conv1d` before them, and those outside a `FoldableSequential`, stay. The module must
-    be in evaluation mode. It is changed in place and returned; use the return value, because a
-    `FoldableSequential` becomes a new, plain `Sequential`.
+    `FoldableSequential` is a `Sequential` that a network marks in this way as safe to simplify. A
+    batch normalisation in it is folded into the `Conv1d` right before it, by torch's
+    `fuse_conv_bn_eval`. Batch normalisations without a `Conv1d` before them, and those outside a
+    `FoldableSequential`, stay. The module must be in evaluation mode. It is changed in place and
+    returned; use the return value, because each `FoldableSequential`, perhaps the module itself, is
+    replaced by a new, plain `Sequential`.
     """
     for name, child in module.named_children():
         setattr(module, name, fold_batch_norms(child))
@@ -210,12 +214,12 @@ def count_trained(module: nn.Module) -> int:
 
 
 def count_features(networks: nn.Module, count: int, channels: int, samples: int) -> int:
-    """Return how many features a copy of a network gives, by a trial on three traces of zeros.
+    """Return how many features each copy of a network gives, by a trial on three traces of zeros.
 
-    `networks` maps (B, K, channels, samples) to (B, K, features); `count` is K, the number of
-    copies. The trial is in evaluation mode, so that no statistics change; afterwards the networks
-    are in training mode. Raises ValueError unless the output holds floats and has three dimensions,
-    three rows and at least one feature, and AttributeError if it is no tensor. What the networks'
+    `networks` computes K copies at once, (B, K, channels, samples) -> (B, K, features); `count` is
+    K. The trial is in evaluation mode, so that no statistics change; afterwards the networks are in
+    training mode. Raises ValueError unless the output holds floats and has three dimensions, three
+    rows and at least one feature, and AttributeError if it is no tensor. What the networks'
     `forward` raises is raised as it is; they stay in evaluation mode then.
     """
     networks.eval()

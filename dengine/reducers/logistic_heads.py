@@ -68,9 +68,10 @@ class RidgeProblem:
     def from_features(cls, g: Tensor, y: Tensor, outside: Tensor, l2: float) -> Self:
         """Return the problem for features g (n, W), labels y (n,) and masks `outside` (K, n).
 
-        Head k, the logistic regression of fold k, is trained on the rows that mask k selects. A
-        column of ones is appended to the features. `l2` is the ridge of every weight but the bias,
-        whose ridge is 0.001 (`BIAS_RIDGE`).
+        The problem is to fit K logistic regressions with a ridge penalty, called heads; nothing is
+        fitted here. Head k is trained on the rows that mask k selects: those outside fold k, one of
+        K groups of rows. A column of ones is appended to the features, for the bias. `l2` is the
+        ridge of every weight but the bias, whose ridge is 0.001 (`BIAS_RIDGE`).
         """
         g32 = torch.cat([g, torch.ones(len(g), 1)], 1)
         ridge = torch.full((len(outside), g32.size(1)), l2, dtype=torch.float64)
@@ -95,11 +96,12 @@ class RidgeProblem:
     def cholesky_of_hessian(self, k: int, p: Tensor) -> Tensor:
         """Return the lower Cholesky factor of the Hessian of classifier head k.
 
-        The factor is float64 (W + 1, W + 1), for W features and the bias. The head is a logistic
-        regression, whose Hessian depends on `p` (n,), the probabilities that head k gives. It
-        covers the rows that train the head, and has the ridge on its diagonal. The product of
-        features is computed in float32, since a Newton step may be inexact. Raises
-        torch.linalg.LinAlgError if the Hessian is not positive definite, or has a NaN.
+        The factor is float64 (W + 1, W + 1), for W features and the bias. Head k is logistic
+        regression k of this problem, and the Hessian is that of its objective (`objective`): the
+        sum of the log losses over the rows that train it, plus the ridge penalty. `p` (n,) are the
+        probabilities that head k gives. The product of features is computed in float32, since a
+        Newton step may be inexact. Raises torch.linalg.LinAlgError if the Hessian is not positive
+        definite, or has a NaN.
         """
         curvature = (self.mask[k] * p * (1.0 - p)).float()
         product = (self.g32 * curvature[:, None]).T @ self.g32  # a step need not be exact
@@ -119,17 +121,19 @@ def fit_heads(
 ) -> HeadsFit:
     """Fit K classifier heads, ridge logistic regressions, by Newton's method with a line search.
 
-    Head k, trained without the labels of fold k, minimises the sum of its log losses plus ``l2 / 2
-    * |w| ** 2``; the ridge of the bias is nearly 0. This is convex, so a head ends at the same
-    weights wherever it starts, unless the steps are limited. A step that raises the loss of a head,
-    ridge included, is halved; if six sizes of the step raise it, it is left out, and the head ends
-    unless its Hessian was an old one. A head has converged when its next step would change no
-    weight by more than about 0.0002. The factor of its Hessian is used again after a step whose
-    largest change is at most a quarter of that of the step before, and at most 0.3. If the
-    leave-one-out loss of a head is above the loss of its base rate, the share of successes among
-    its rows, the head is replaced by the base rate; a head whose rows are all of one class stays.
-    This is decided for each head alone, since a common decision would let the labels of fold k
-    choose head k.
+    Head k, trained without the labels of fold k (one of K groups of rows), minimises the sum of its
+    log losses plus ``l2 / 2 * |w| ** 2``; the ridge of the bias is 0.001. This is convex, so a head
+    ends at the same weights wherever it starts, unless the steps are limited. A step that raises
+    the loss of a head, ridge included, is halved. If six sizes of the step raise it, the head stays
+    where it is, and has ended, unless the factor of its Hessian was from an earlier step. A head
+    has converged when its next step would change no weight by more than about 0.0002. The Cholesky
+    factor of its Hessian is used again after a step whose largest change is at most a quarter of
+    that of the step before, and at most 0.3; otherwise it is computed anew.
+
+    If the leave-one-out loss of a head is above the loss of its base rate, the share of successes
+    among its rows, the head is replaced by the base rate; a head whose rows are all of one class
+    stays. This is decided for each head alone, since a common decision would let the labels of fold
+    k influence head k.
 
     Parameters
     ----------
@@ -146,15 +150,19 @@ def fit_heads(
     max_iter : int
         Largest number of steps.
     stop : StopRule
-        Asked before each step, which all heads take together; if it has a deadline, its `late` and
-        `last_step` are set. The steps also end when all heads have converged, or after `max_iter`.
+        Limit on the steps, by their number or by a deadline. It is asked before each step, which
+        all heads take together. If it has a deadline, its `late` (whether the deadline ended the
+        fit) and `last_step` (when the last step began) are set. The steps also end when all heads
+        have converged, or after `max_iter`.
     min_steps : int, default 0
-        Number of first steps that the deadline of `stop` does not prevent.
+        Number of first steps that are taken even after the deadline of `stop`.
 
     Returns
     -------
     HeadsFit
-        Weights, leave-one-out logits, number of steps.
+        `w` (K, W + 1) are the weights, in a new tensor. `left_out` (K, n) is the logit of each row
+        by each head as if it were fitted without the row (or of the base rate, if that replaced the
+        head), of use only if the row trains the head. `n_steps` is the number of steps.
 
     Raises
     ------
@@ -207,9 +215,10 @@ def base_rate_if_better(
 ) -> tuple[Tensor, Tensor]:
     """Replace each classifier head that does worse than its base rate by the base rate.
 
-    The base rate is the share of successes among all rows that train the head. A head does worse if
-    its leave-one-out log loss is larger than the log loss of the base rate, which is slightly too
-    small, because it is no leave-one-out loss. A head whose rows are all of one class is kept.
+    A head is a logistic regression. Its base rate is the share of successes among all rows that
+    train it. A head does worse if its leave-one-out log loss is larger than the log loss of the
+    base rate, which is slightly too small, because it is no leave-one-out loss. A head whose rows
+    are all of one class is kept.
 
     Parameters
     ----------
@@ -225,8 +234,8 @@ def base_rate_if_better(
     Returns
     -------
     w, left_out : Tensor
-        New tensors like the arguments. For a head that was replaced, all weights but the bias are
-        0, and its row of `left_out` is the logit of the base rate.
+        New tensors like the arguments. For a head that was replaced, the bias and all of its row of
+        `left_out` are the logit of the base rate, and the other weights are 0.
     """
     rate = torch.logit((mask @ y) / mask.sum(1))[:, None].expand_as(left_out)
     # Of rows of one class, the rate has an infinite logit and a loss of NaN: the head stays.
@@ -237,12 +246,17 @@ def base_rate_if_better(
 
 
 def leave_one_out(problem: RidgeProblem, logits: Tensor, factors: Tensor) -> Tensor:
-    """Approximate the logit of each row by each classifier head fitted without the row.
+    """Approximate the logit that each classifier head would give each row if fitted without it.
+
+    A head is a logistic regression of `problem`. The result is its logit plus ``h (p - y) / (1 - h
+    p (1 - p))``, where p is the probability that it predicts, y the label, and h the leverage of
+    the row, its squared length in the metric of the inverse Hessian. A divisor below 0.05 is
+    replaced by 0.05.
 
     Parameters
     ----------
     problem : RidgeProblem
-        Features and labels.
+        Holds features and labels.
     logits : Tensor of float64, shape (K, n)
         Logits by the fitted heads.
     factors : Tensor of float64, shape (K, W + 1, W + 1)
@@ -251,8 +265,8 @@ def leave_one_out(problem: RidgeProblem, logits: Tensor, factors: Tensor) -> Ten
     Returns
     -------
     Tensor of float64, shape (K, n)
-        Exact to first order for rows that train the head. The divisor of the correction is at
-        least 0.05; where it would be smaller, the logit is not exact. Of no use for other rows.
+        For rows that train the head it is exact to first order, unless the divisor was replaced.
+        For other rows it is of no use.
 
     References
     ----------

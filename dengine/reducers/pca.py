@@ -41,7 +41,8 @@ class PcaReducer(Reducer):
     def fit(self, X: ArrayLike, y: ArrayLike | None = None) -> Self:
         """Compute the principal axes of traces (`components_`) and their mean (`mean_`).
 
-        A trace is one row, channel after channel.
+        A trace is one row, channel after channel; `n_components` axes are kept. The shape of the
+        traces is kept, too, as `trace_shape_`.
 
         Parameters
         ----------
@@ -57,8 +58,8 @@ class PcaReducer(Reducer):
         Raises
         ------
         SettingError
-            If there are `n_components` traces or fewer, or if a trace has fewer samples than that,
-            all channels together.
+            If there are `n_components` traces or fewer, or if a trace has fewer than `n_components`
+            samples, all channels together.
         TraceError, ValueError, TypeError
             If X has another shape, has no trace or is sparse, if a value is not finite, or if no
             absolute value reaches 1e-12 but not all samples are 0 (`check_traces`). ValueError also
@@ -92,8 +93,9 @@ class PcaReducer(Reducer):
     def get_state(self) -> State:
         """Return arrays from which `set_state` restores the reducer bit for bit.
 
-        They are "mean" (C * T,), "components" (n_components, C * T) and "shape", (C, T). The first
-        two are the reducer's own arrays, not copies. Raises NotFittedError before `fit`.
+        They are "mean" (C * T,), "components" (n_components, C * T) and "shape", (C, T), where a
+        trace has C channels of T samples. The first two are the reducer's own arrays, not copies.
+        Raises NotFittedError before `fit`.
         """
         check_is_fitted(self, "components_")
         return {
@@ -103,10 +105,10 @@ class PcaReducer(Reducer):
         }
 
     def set_state(self, state: Arrays) -> Self:
-        """Restore what `get_state` returned, and return self; the parameters must be the same.
+        """Restore what `get_state` returned, and return self.
 
-        The arrays are copied; the shape of the traces is set from "shape". Raises KeyError if an
-        array is missing.
+        The constructor's parameters must be the same, which is not checked. The arrays are copied;
+        the shape of the traces is set from "shape". Raises KeyError if an array is missing.
         """
         self.mean_ = np.array(state["mean"])
         self.components_ = np.array(state["components"])

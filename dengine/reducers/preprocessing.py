@@ -49,9 +49,9 @@ class Preprocessor(nn.Module):
         """Set the mean and scale of each channel, and the scale of its differences, in place.
 
         Only the first 256 of the traces (n, C, T) are read. First `average` neighbouring samples
-        are averaged to one. A channel x is then standardised to (x - mean) * scale, clipped at ±8.
-        `difference_scale` is for the differences in time of the standardised channel. A scale is 1
-        / (standard deviation + a small floor); the floor, 1e-6, is for a channel that never moved.
+        are averaged to one. Then `forward` standardises a channel x to (x - mean) * scale, clipped
+        at ±8, and multiplies its differences in time by `difference_scale`. A scale is 1 /
+        (standard deviation + 1e-6), so that a channel that never moved has a finite scale.
         """
         averaged = self.average_samples(traces[:STATISTICS_TRACES]).double()
         self.mean.copy_(averaged.mean((0, 2))[:, None])
@@ -60,11 +60,13 @@ class Preprocessor(nn.Module):
         self.difference_scale.copy_(1.0 / (differences.std((0, 2), correction=0)[:, None] + FLOOR))
 
     def forward(self, x: Tensor) -> Tensor:
-        """Raw traces (B, C, T) -> averaged, standardised, with differences: (B, 2 * C, L).
+        """Average and standardise traces, append differences in time: (B, C, T) -> (B, 2 * C, L).
 
-        Channel 2 c + 1 holds the differences of channel 2 c in time, times `difference_scale`; the
-        first is 0. All values are clipped at ±8. Before `learn` nothing is scaled or shifted. L is
-        T // `average`. If T is no multiple of `average`, the first samples are left out.
+        First `average` neighbouring samples are averaged to one, so that L is T // `average`; if T
+        is no multiple of `average`, the first samples are left out. Channel 2 c of the result is
+        channel c, less `mean` and times `scale`, which `learn` sets. Channel 2 c + 1 holds the
+        differences of channel 2 c in time, times `difference_scale`; the first is 0. All values are
+        clipped at ±8. Before `learn` nothing is scaled or shifted.
         """
         x = self.standardise(self.average_samples(x))
         differences = (x[:, :, 1:] - x[:, :, :-1]) * self.difference_scale

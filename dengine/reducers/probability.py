@@ -56,17 +56,20 @@ class ProbabilityReducer(Reducer):
     def fit(self, X: ArrayLike, y: ArrayLike | None = None, *, folds: Ints | None = None) -> Self:
         """Build the model anew and train it; earlier trainings are discarded.
 
-        If it raises, earlier trainings may be lost already, as after SettingError for a single
-        class. Unlike `train` it takes fewer than 20 traces, too.
+        The model predicts the probability of success. It has K copies, one for each fold (one of K
+        fixed groups of traces, where K is the parameter `folds` of the constructor), and copy k is
+        trained without the labels of fold k. If `fit` raises an error, earlier trainings may be
+        lost already, for example if the labels of a `RocketReducer` are of one class. Unlike
+        `train` it takes fewer than 20 traces, too.
 
         Parameters
         ----------
         X : array of float, shape (n, T) or (n, C, T)
         y : array, shape (n,)
-            Labels of two classes; the one that sorts last is success. `TorchReducer` trains on a
-            single class, too.
+            Labels of two classes; the class that sorts last is success. The subclass `TorchReducer`
+            trains on a single class, too.
         folds : array of int64, shape (n,), optional
-            Fold of each trace, 0 to K - 1. None: by a hash of its content.
+            Fold of each trace, 0 to K - 1. None: a hash of the trace's content chooses it.
 
         Returns
         -------
@@ -75,13 +78,15 @@ class ProbabilityReducer(Reducer):
         Raises
         ------
         SettingError
-            If a parameter is out of its range, y is None, labels or folds do not fit the traces, or
-            a trace has a single sample. `TorchReducer`: if the network does not give (B, features),
-            the checkpoint cannot be used, or fewer than two traces lie outside a fold.
-            `RocketReducer`: if the traces outside a fold have a single class.
+            If a parameter is out of its range, y is None or has more than two classes, there is not
+            one label and one fold for each trace, a fold is not from 0 to K - 1, or a trace has a
+            single sample. `TorchReducer` also: if its network does not give (B, features), its
+            checkpoint (stored weights to start from) cannot be used, or fewer than two traces lie
+            outside a fold. `RocketReducer` also: if the traces outside a fold have a single class.
         TraceError, ValueError, TypeError
             If X is not of one of these shapes or sparse, a value is not finite, or all samples are
-            below 1e-12 but not all are 0 (`check_traces`).
+            below 1e-12 but not all are 0 (`check_traces`). ValueError also for a negative
+            `random_state`.
         """
         traces = self.check_traces(X, reset=True)
         labels = binary_labels(y, len(traces), type(self).__name__)
@@ -93,10 +98,12 @@ class ProbabilityReducer(Reducer):
     def untrained_module(self, X: Floats) -> nn.Module | None:
         """Return a module that can be compiled before the training on traces X (n, C, T).
 
-        It is `module()` if the reducer is initialised. Otherwise it is the module of a clone that
-        is initialised for X, and this reducer stays as it is. None if TorchScript cannot compile
-        it, which is logged once. If the reducer is initialised, X is not looked at; otherwise the
-        errors of `check_traces` and `_initialize` are raised.
+        It embeds traces like the module after the training; only the weights differ, which can be
+        loaded later. If the reducer is initialised (its model is built for a shape of traces), it
+        is what `module` returns, and X is not looked at. Otherwise a clone is initialised for X,
+        and its module is returned; this reducer stays as it is, and the errors of `check_traces`
+        and `_initialize` are raised. None if TorchScript cannot compile the module, which is logged
+        once.
         """
         if self.is_initialized_:
             return self.module()
@@ -107,9 +114,11 @@ class ProbabilityReducer(Reducer):
     def _check_and_initialize(self, X: Floats) -> Floats:
         """Check traces, initialise the model if need be, and return the traces as (n, C, T).
 
-        The traces that initialise it set the shape and the scales of the channels; no label is
-        read. If it must be initialised, SettingError is raised for fewer than 20 traces, and what
-        `_initialize` raises. Raises the errors of `check_traces`.
+        The model is initialised if it was not built yet; these traces then set the shape that later
+        traces must have, and the scales of the channels. No label is read. In this case
+        SettingError is raised for fewer than 20 traces, and what `_initialize` raises, such as
+        SettingError for a parameter out of its range. The errors of `check_traces` are raised in
+        both cases.
         """
         if not self.is_initialized_:
             expect(

@@ -114,12 +114,13 @@ class FeatureEmbedding(nn.Module):
         return self.embed_features(self.encoder(x))
 
     def embed_features(self, f: Tensor) -> Tensor:
-        """Scaled features f (B, P) -> embedding (B, K, d), a point in each embedding space.
+        """Embed traces, given by their scaled features f (B, P), in each of K spaces: (B, K, d).
 
-        Head k, the classifier that is trained without the labels of fold k, gives the first
+        There is an embedding space for each of K folds (fixed groups of traces). Classifier head k,
+        a logistic regression that is trained without the labels of fold k, gives the first
         coordinate in space k: the probability of success, from 0 to 1. If d is 2, the second
-        coordinate is the sigmoid of a principal component, scaled to 0 to 0.04; it is the same in
-        all spaces.
+        coordinate is the sigmoid of a principal component of the features, scaled to 0 to 0.04; it
+        is the same in all spaces.
         """
         columns = torch.addmm(self.bias, f, self.weight)
         products = pairwise_products(columns.narrow(1, self.n_scores, self.n_leading))
@@ -162,8 +163,10 @@ class Tower(NamedTuple):
     ) -> Self:
         """Compute the principal components of features, and classifier heads on the components.
 
-        The logits of a head are the least-squares fit, over the rows of `f`, to those of a given
-        head on the features themselves.
+        A tower holds both: the components of a group of features, and K heads, logistic
+        regressions. The heads are taken over from given heads on the features themselves: over the
+        rows of `f`, the logits of a new head are the least-squares fit to the logits of the given
+        head.
 
         Parameters
         ----------
@@ -214,28 +217,29 @@ def weigh_towers(
 ) -> tuple[list[Tensor], Tensor]:
     """Choose for each fold the shares by which the logits of several towers are mixed to one logit.
 
-    Each `Tower`, a group of features, has a classifier head k, trained without the labels of fold
-    k. The first tower starts with a share of 1. Then each further tower gets a share of 0 to 1 in
-    steps of 0.1, and the shares of the towers before it are multiplied by the rest. The share is
-    chosen that has the smallest penalised log loss on the rows outside fold k (of several the
-    largest), so that labels of fold k do not reach embedding space k.
+    Each `Tower`, a group of features, has a classifier head for each of K folds (groups of rows):
+    head k is a logistic regression, trained without the labels of fold k. The first tower starts
+    with a share of 1. Then each further tower gets a share s of 0 to 1 in steps of 0.1, and the
+    shares of the towers before it are multiplied by 1 - s. That s is chosen for which the log loss
+    on the rows outside fold k, plus a penalty, is smallest (of several the largest). So the labels
+    of fold k do not influence mixed logit k.
 
     Parameters
     ----------
     left_out : list of Tensor of float64, shape (K, n)
         Leave-one-out logits of each tower.
     penalties : list of float
-        For each tower, by how many nats it must lower the log loss, summed over the rows, to get a
-        share of 1; for a smaller share, in proportion less. The first value is not read.
+        For each tower, the penalty of a share of 1, in nats of the log loss summed over the rows;
+        that of a smaller share is in proportion. The first value is not read.
     y : Tensor of int64, shape (n,)
-        Labels.
+        Labels, 1 or 0.
     outside : Tensor of bool, shape (K, n)
         Which rows are outside fold k.
 
     Returns
     -------
     shares : list of Tensor of float32, shape (K,)
-        Shares of each tower; over all towers they sum to 1.
+        The K shares of each tower; for each fold they sum to 1 over all towers.
     losses : Tensor of float64, shape (K,)
         Leave-one-out log loss of the mixed logit k over the rows outside fold k, in nats per row.
     """
@@ -320,20 +324,26 @@ class RocketReducer(ProbabilityReducer):
         stop: StopRule | None = None,
         numbers: Ints | None = None,
     ) -> Floats:
-        """Fit the classifier heads, starting from their last weights; return the reference points.
+        """Fit the classifier heads, from their last weights on; return the points of the traces.
 
-        The kernels are drawn at the first call of `train` or `precompute`, unless `fit` or
-        `set_state` has set them, and stay. X are traces (n, C, T), y (n,) their labels 1 or 0,
-        `folds` (n,) their folds. `numbers` (n,), those of the labels, increasing, identify the
-        traces: a trace that was in the last call of `train` or `precompute` has its features in a
-        cache. None: nothing is cached. `stop` may end the Newton steps, but in the first fit up to
+        X are traces (n, C, T), y (n,) their labels 1 or 0, `folds` (n,) their folds: a fold is one
+        of K fixed groups of traces. Head k, a logistic regression on features of a trace, is fitted
+        without the labels of fold k. The features come from convolution kernels, which are drawn at
+        the first call of `train` or `precompute`, unless `fit` or `set_state` has set them, and
+        stay. `numbers` (n,), increasing, are the numbers of the labels, which identify the traces:
+        the features of a trace that was in the last call of `train` or `precompute` are taken from
+        a cache, which then holds these traces. None: the cache is not used. `stop` (a limit on the
+        number of steps, a deadline, or both) may end the Newton steps, but in the first fit up to
         three are taken even after its deadline. If there are more than 4000 traces, the heads are
         fitted to 4000 of them, chosen by a hash of the numbers, or of the row indices if there are
-        no numbers. The module `net_`, and so the module that `module` returned before, is
-        changed in place. The points are float32 (n, d), row i in embedding space ``folds[i]``.
-        Raises the errors of `check_traces`, and SettingError for fewer than 20 traces, if the
-        traces outside a fold have a single class, and at the first call for a parameter out of its
-        range or fewer than 2 samples.
+        no numbers.
+
+        The module `net_`, which embeds, is changed in place, and so is the module that `module`
+        returned before. The points are float32 (n, d); row i lies in embedding space ``folds[i]``,
+        whose first coordinate is the probability by head ``folds[i]``. Raises the errors of
+        `check_traces`, and SettingError for fewer than 20 traces, if the traces outside a fold have
+        a single class, and at the first call also for a parameter out of its range, fewer than 2
+        samples or a `random_state` of another type, and ValueError for a negative one.
         """
         expect(
             len(X) >= MIN_TRACES, f"at least {MIN_TRACES} traces", len(X), "verify more parts first"
@@ -343,12 +353,15 @@ class RocketReducer(ProbabilityReducer):
         return self.train_heads(traces, y, folds, stop or StopRule(), numbers)
 
     def _initialize(self, traces: Floats) -> None:
-        """Build the module `net_`, with kernels and the channels' scales from traces (n, C, T).
+        """Build the module `net_`, which embeds traces, for traces of this shape (n, C, T).
 
-        A channel is scaled so that its samples have the mean 0 and the standard deviation 1 in at
-        most 256 of the traces; one that never moves is only shifted. The classifier heads are 0. No
-        label is read. Earlier fits are discarded. Raises SettingError for a parameter out of its
-        range or fewer than 2 samples.
+        No label is read. The convolution kernels are drawn with the seed `random_state`, and their
+        thresholds set from the traces. A channel is scaled so that its samples have the mean 0 and
+        the standard deviation 1 in at most 256 of the traces; one that never moves is only shifted.
+        The weights of the classifier heads (logistic regressions on the kernels' features) are 0.
+        Earlier fits are discarded, and `is_initialized_` becomes True. Raises SettingError for a
+        parameter out of its range, fewer than 2 samples or a `random_state` of another type, and
+        ValueError for a negative one.
         """
         x = torch.from_numpy(traces)
         self.build(traces.shape[1], traces.shape[2], averaging(x))
@@ -356,12 +369,15 @@ class RocketReducer(ProbabilityReducer):
         self.is_initialized_ = True
 
     def build(self, channels: int, samples: int, average: int) -> None:
-        """Make the module `net_` for traces of this shape, with kernels and classifier heads of 0.
+        """Make a new `net_` for traces of this shape, with kernels and classifier heads of 0.
 
-        `towers_` and the cache of features become empty, `n_fits_` and `n_component_traces_` 0;
-        what a fit reports (`n_iter_`, `holdout_losses_`) stays. `trace_shape_`, `n_features_in_`
-        and `average_` are set. `is_initialized_` becomes False; the caller sets the kernels, and
-        then makes it True. `average` is the number of samples that are averaged to one. Raises
+        `net_` is the module that embeds traces; its heads are logistic regressions on the features
+        that the convolution kernels give. The caller sets the kernels, and then makes
+        `is_initialized_` True, which becomes False here. `average` is the number of samples that
+        are averaged to one. `trace_shape_`, `n_features_in_` and `average_` are set. `towers_` (the
+        groups of features with their heads) and the cache of features become empty, `n_fits_` (the
+        number of fits) and `n_component_traces_` (of the traces from which principal components
+        were computed) 0; what a fit reports (`n_iter_`, `holdout_losses_`) stays. Raises
         SettingError for a parameter out of its range or fewer than 2 samples.
         """
         self.check()
@@ -397,20 +413,26 @@ class RocketReducer(ProbabilityReducer):
         stop: StopRule,
         numbers: Ints | None = None,
     ) -> Floats:
-        """Fit the classifier heads like `train`, but without checking the input.
+        """Fit the classifier heads like `train`, but without checking the input; return the points.
 
         Call `_initialize` first. Traces are (n, C, T), labels (n,) 1 or 0; they may be of one
-        class. `stop` and `numbers`, those of the labels, which must increase, are as in `train`.
+        class. `folds` (n,) are the folds, 0 to K - 1: fixed groups of traces. `numbers` (n,), the
+        increasing numbers of the labels, identify the traces: features are computed only for those
+        that the cache lacks, which then holds these traces alone. Without numbers the cache is not
+        used.
 
-        Head k starts from its last weights, and is fitted on the rows outside fold k of at most
-        4000 rows (`sample_rows`). `stop` may end each tower's Newton steps; in the first fit up to
-        three are taken even after its deadline. The principal components are computed anew at the
-        first fit, after every 20 fits, and if there are at least 1.5 times as many rows as at the
-        last time. The heads of each `Tower` are written to `net_`, weighed to one logit. `towers_`
-        and what a fit reports (`n_iter_`, most steps of a tower, and `holdout_losses_`, see the
-        class) are replaced, `n_fits_` grows, and with `numbers` the cache of features then has
-        these traces alone. Returns the points of the traces, float32 (n, d), row i in embedding
-        space ``folds[i]``, whose head did not see the label of row i.
+        Head k is a logistic regression. It starts from its last weights, and is fitted on the rows
+        outside fold k of at most 4000 rows (`sample_rows`). Each `Tower`, a group of features with
+        its principal components, has K heads. `stop` (a limit on the number of steps, a deadline,
+        or both) may end the Newton steps of each tower; in the first fit up to three are taken even
+        after its deadline. The principal components are computed anew at the first fit, after every
+        20 fits, and if there are at least 1.5 times as many rows as at the last time.
+
+        The heads of all towers, weighed to one logit, are written to `net_`, the module that
+        embeds. `towers_` and what a fit reports (`n_iter_`, the most steps of a tower, and
+        `holdout_losses_`, a leave-one-out loss for each fold) are replaced, and `n_fits_` grows by
+        1. The points are float32 (n, d), row i in embedding space ``folds[i]``, whose head did not
+        see the label of row i.
         """
         raw = self.raw_features(traces, numbers)
         with torch.no_grad():
@@ -457,11 +479,12 @@ class RocketReducer(ProbabilityReducer):
             self.raw_features(self._check_and_initialize(X), numbers)
 
     def _set_heads(self, shares: list[Tensor]) -> None:
-        """Write the classifier heads of `towers_` to `net_`, which then gives K logits.
+        """Write the classifier heads of `towers_`, weighed by `shares`, to `net_`, in place.
 
-        Logit k of `net_`, for embedding space k, becomes the sum over the towers of share k times
-        the tower's own logit k. `shares` has a tensor (K,) for each `Tower`; `weigh_towers` returns
-        them. The heads in `net_` are overwritten.
+        `net_` embeds traces in K spaces. Each `Tower`, a group of features, has K heads, logistic
+        regressions. Logit k of `net_`, for space k, becomes the sum over the towers of share k
+        times the tower's own logit k. `shares` has a tensor (K,) for each tower; `weigh_towers`
+        returns them. The heads that `net_` had before are overwritten.
         """
         net = self.net_
         logit_columns = slice(0, net.n_scores, self.n_components)
@@ -492,11 +515,12 @@ class RocketReducer(ProbabilityReducer):
         """Compute feature scales and principal components anew from unscaled features (n, P).
 
         At most 1000 rows of `raw`, evenly spaced, are read; `n_component_traces_` becomes n.
-        `towers_` gets a new `Tower` for each group of features, whose classifier heads are the ones
-        nearest to the old heads, or 0 if there are none, and a last one for the products of the
-        leading components, whose heads are 0. Scales, leading components and, if `n_components` is
-        2, the second axis of the embedding are written to `net_`; the heads are not: call
-        `_set_heads` before `net_` is used.
+        `towers_` gets a new `Tower` for each group of features: its principal components, and K
+        classifier heads (logistic regressions) whose logits are nearest to those of the old heads,
+        or 0 if there are none. A last tower, whose heads are 0, has as features the products of
+        every two leading components of the first tower. Scales, leading components and, if
+        `n_components` is 2, the second axis of the embedding are written to `net_`, the module that
+        embeds. The heads are not: call `_set_heads` before `net_` is used.
         """
         net = self.net_
         encoder = net.encoder
@@ -532,13 +556,15 @@ class RocketReducer(ProbabilityReducer):
         self._set_axes(f[:, encoder.towers[0]])
 
     def _set_axes(self, f: Tensor) -> None:
-        """Write the leading components of the first `Tower`, and the second coordinate, to `net_`.
+        """Write the axes of the first tower's leading components, and the second axis, to `net_`.
 
-        The leading components are the first four, or fewer if there are not so many. The products
-        of every two of them are the features of the last tower. If there is a second coordinate, it
-        is a sigmoid of the first component. Before the sigmoid the component is scaled to mean 0
-        and standard deviation 2 over the tower's features `f` (n, p). Its sign is changed if it
-        would point against the second coordinate that `net_` had before.
+        The first `Tower`, a group of features with its principal components, is ``towers_[0]``;
+        `net_` is the module that embeds, and is changed in place. The leading components are the
+        first four, or fewer if there are not so many. The products of every two of them are the
+        features of the last tower. If the embedding has a second coordinate, it is a sigmoid of the
+        first component. Before the sigmoid the component is scaled to mean 0 and standard deviation
+        2 over the tower's features `f` (n, p). Its sign is changed if it would point against the
+        second coordinate that `net_` had before.
         """
         net = self.net_
         columns = net.encoder.towers[0]
@@ -555,12 +581,12 @@ class RocketReducer(ProbabilityReducer):
     def raw_features(self, traces: Floats, numbers: Ints | None = None) -> Tensor:
         """Return the unscaled features (n, P) of traces (n, C, T), as a tensor.
 
-        They are float32, computed from the outputs of the kernels. `numbers` (n,), those of the
-        labels, increasing, identify the traces: only features that the cache lacks are computed.
-        The numbers must be neither -1 nor out of order, which is not checked; the array is kept,
-        not copied. Afterwards the cache holds the features of these traces and no others; the
-        tensor that is returned shares its memory. Without numbers the cache is neither read nor
-        written.
+        They are float32, computed from the outputs of the convolution kernels. `numbers` (n,) are
+        the numbers of the traces' labels, which identify the traces: only features that the cache
+        lacks are computed. The numbers must strictly increase and not be -1, which is not checked.
+        Afterwards the cache holds the features of these traces and no others; it keeps `numbers`
+        and shares its memory with the returned tensor, so change neither. Without numbers the cache
+        is neither read nor written.
         """
         with torch.no_grad():
             return torch.from_numpy(
@@ -605,10 +631,11 @@ class RocketReducer(ProbabilityReducer):
     def get_state(self) -> State:
         """Return arrays from which `set_state` restores the reducer bit for bit, by name.
 
-        They are the shape, the counters, the losses, the fields of each `Tower`, and the tensors of
-        `net_`, whose names begin with "net.". The cache of features is not among them. Losses and
-        towers are not copies. Raises NotFittedError before there are kernels, AttributeError before
-        the first fit.
+        They are the shape of the traces, the counters (of fits, traces and steps), the losses, the
+        arrays of each `Tower` (a group of features with its classifier heads), and the tensors of
+        `net_`, the module that embeds, whose names begin with "net.". The cache of features is not
+        among them. The losses and the towers' arrays are not copies. Raises NotFittedError before
+        there are kernels, AttributeError before the first fit.
         """
         check_is_fitted(self, "net_")
         state = {
@@ -623,13 +650,15 @@ class RocketReducer(ProbabilityReducer):
         return state | module_state(self.net_, "net.")
 
     def set_state(self, state: Arrays) -> Self:
-        """Restore what `get_state` returned, and return self; the parameters must be the same.
+        """Restore what `get_state` returned, and return self.
 
-        Afterwards the cache of features is empty. Raises SettingError for a parameter out of its
-        range, StoreError if an array of `net_` is missing or has a size that does not follow from
-        the parameters, ValueError if a `Tower` lacks an array, and KeyError if the shape, the
-        counters (of fits, traces and steps) or the losses (log loss of each space) are missing. The
-        sizes of a tower's arrays are not checked. After an error the fitted model may be lost.
+        The constructor's parameters must be the same. Afterwards the cache of features is empty.
+        Raises SettingError for a parameter out of its range, and StoreError if an array of `net_`,
+        the module that embeds, is missing or has a size that does not follow from the parameters.
+        Raises ValueError if a `Tower`, a group of features with its classifier heads, lacks an
+        array, and KeyError if the shape, the counters (of fits, traces and steps) or the losses
+        (log loss of each space) are missing. The sizes of a tower's arrays are not checked. After
+        an error the fitted model may be lost.
         """
         channels, samples = self.restore_shape(state)
         average, *counts = map(int, state["counts"])
@@ -666,14 +695,15 @@ class RocketReducer(ProbabilityReducer):
 
 
 def sample_rows(n: int, numbers: Ints | None) -> Ints | slice:
-    """Draw `MAX_TRAINING_TRACES`, 4000, of n rows, without reading labels; return them in order.
+    """Draw 4000 (`MAX_TRAINING_TRACES`) of n rows, always the same ones; return their indices.
 
     They are int64 (4000,), increasing. If there are no more rows than that, the result is instead
-    ``slice(None)``, which selects all. The same arguments give the same rows.
+    ``slice(None)``, which selects all. No label is read.
 
-    `numbers` (n,) are the numbers of the rows' labels, the same in every training; None stands for
-    0 to n - 1. The rows whose numbers have the smallest hashes are drawn, old and new labels alike.
-    So most rows are those of the last fit, and the classifier heads start near their final weights.
+    `numbers` (n,) are the numbers of the rows' labels; a row keeps its number from training to
+    training. None stands for 0 to n - 1. The rows whose numbers have the smallest hashes are drawn,
+    old and new labels alike. So most rows are those of the last fit, and the classifier heads that
+    are fitted to them start near their final weights.
     """
     if n <= MAX_TRAINING_TRACES:
         return slice(None)

@@ -160,11 +160,12 @@ class RocketEncoder(nn.Module):
     def raw_features(self, x: Tensor) -> Tensor:
         """Compute unscaled features (B, P) of raw traces (B, C, T): of tower 1, then of tower 2.
 
-        The features of tower 1 are from 0 to 3: the mean over a region, plus twice the mean over
-        the whole trace, of a kernel's outputs, which are limited to 0 to 1 (`ramp_features`). Those
-        of tower 2 say how often each kernel of a group has the largest, and how often the smallest
-        output (`competition_features`). If `groups` is 0, there is no tower 2. `scale_features`
-        standardises the features.
+        A tower is a group of features from convolution kernels. The features of tower 1 are from 0
+        to 3: the mean over a region, plus twice the mean over the whole trace, of a kernel's
+        outputs, which are limited to 0 to 1 (`ramp_features`). In tower 2 kernels compete in groups
+        of 8; its features say how often each kernel of a group has the largest, and how often the
+        smallest output (`competition_features`). If `groups` is 0, there is no tower 2.
+        `scale_features` standardises the features.
         """
         values = self.read_taps(self.average_samples(x))
         n_dense = self.n_dense_taps
@@ -187,10 +188,11 @@ class RocketEncoder(nn.Module):
         return scaled.clamp_(-self.feature_clip, self.feature_clip)
 
     def average_samples(self, x: Tensor) -> Tensor:
-        """Raw traces (B, C, T) -> averaged traces (B, C, L), scaled by `scale` and `shift`.
+        """Average samples and scale channels: raw traces (B, C, T) -> (B, C, L).
 
-        If T is no multiple of `average`, the first samples are left out. The scaled values are
-        clipped at ±1e6.
+        Each `average` neighbouring samples become their mean, and a channel x then becomes `scale`
+        * x + `shift`, which `learn` sets. If T is no multiple of `average`, the first samples are
+        left out. The scaled values are clipped at ±1e6.
         """
         if self.average > 1:
             x = x[..., self.skipped :] if self.skipped > 0 else x
@@ -200,13 +202,14 @@ class RocketEncoder(nn.Module):
         return torch.addcmul(self.shift, x, self.scale).clamp_(-1e6, 1e6)
 
     def read_taps(self, x: Tensor) -> Tensor:
-        """Read the inputs of the kernels from averaged traces (B, C, L): (C, taps, B).
+        """Read all inputs of the kernels from averaged traces (B, C, L): (C, number of taps, B).
 
-        A tap is an input of a kernel at one place in the trace; L counts the frames (the means of
-        `average` samples). For each tap, `taps` has an index into a row of L frames, then the L - 1
-        differences of successive frames, then a 0, which stands for what lies beyond the ends. The
-        taps of tower 1 come first, then those of tower 2 in the trace, then in its differences. The
-        batch is the last axis, so that reading a tap copies a row.
+        A tap is an input of a kernel at one place in the trace, and L is the number of averaged
+        samples. The traces are first put into rows of L samples, then the L - 1 differences of
+        successive samples, then a 0, which stands for what lies beyond the ends; for each tap, the
+        buffer `taps` has its index into such a row. The taps of tower 1 (the first group of
+        features) come first, then those of tower 2 in the trace, then in its differences. The batch
+        is the last axis, so that reading a tap copies a row.
         """
         batch = x.size(0)
         differences = x[:, :, 1:] - x[:, :, :-1]
@@ -218,9 +221,9 @@ class RocketEncoder(nn.Module):
     def as_windows(self, values: Tensor, n: int) -> Tensor:
         """Arrange inputs of n dilations, `values` (C, n * 9 * P, B), as (n, C * 9, P * B).
 
-        P is the number of places in a trace, 9 the number of inputs of a kernel in a channel. A
-        column of the result, a window, holds all inputs of a kernel at one place of one trace, so
-        that a convolution is a matrix product.
+        P is the number of places in a trace at which the kernels are applied, and 9 the number of
+        inputs of a kernel in each of C channels. A column of the result, a window, holds all inputs
+        of a kernel at one place of one of B traces, so that a convolution is a matrix product.
         """
         channels = values.size(0)
         taps = self.kernel_size
@@ -233,11 +236,12 @@ class RocketEncoder(nn.Module):
     def ramp_features(self, windows: Tensor, batch: int) -> Tensor:
         """Compute the features of tower 1, ramps of kernels: (B, D * F * R).
 
-        `windows` (D, C * 9, P * B) are the inputs from `batch` = B traces, see `as_windows`, of F
-        kernels at each of D dilations and P places. R regions divide the trace. The output of a
-        kernel at a place goes through a ramp from 0 to 1 around its threshold. A feature is the
-        mean of the ramp over a region, plus twice its mean over the whole trace. In the order of
-        the features, dilations vary slowest and regions fastest.
+        Tower 1 is the first of two groups of features. `windows` (D, C * 9, P * B) are the inputs
+        from `batch` = B traces, see `as_windows`, of F kernels at each of D dilations and P places.
+        R regions divide the trace. The output of a kernel at a place goes through a ramp, which
+        rises from 0 to 1 around the kernel's threshold and is flat beyond. A feature is the mean of
+        the ramp over a region, plus twice its mean over the whole trace. In the order of the
+        features, dilations vary slowest and regions fastest.
         """
         h = torch.baddbmm(self.threshold, self.kernel, windows).clamp_(0.0, 1.0)  # (D, F, P * B)
         if batch == 1:  # one product whose columns are the regions takes four times as long
@@ -251,12 +255,13 @@ class RocketEncoder(nn.Module):
     def competition_features(self, windows: Tensor, batch: int) -> Tensor:
         """Compute the features of tower 2, competing kernels: (B, 4D * G * 8).
 
-        `windows` (2D, C * 9, Q * B) are the inputs from `batch` = B traces, see `as_windows`: D
-        dilations of the trace, then D of its differences. G groups of 8 kernels compete at each of
-        Q places. The first half of the features tells of each kernel how often its output is the
-        largest of its group, the second half how often it is the smallest. "How often" is the root
-        of the mean over the places of a score: 1 for the winner, 1 - distance for an output that is
-        less than 1 away from it, else 0.
+        Tower 2 is the second of two groups of features. `windows` (2D, C * 9, Q * B) are the inputs
+        from `batch` = B traces, see `as_windows`: D dilations of the trace, then D of its
+        differences in time. G groups of 8 kernels compete at each of Q places. The first half of
+        the features tells of each kernel how often its output is the largest of its group, the
+        second half how often it is the smallest. "How often" is the root of the mean over the
+        places of a score: 1 for the winner, 1 - distance for an output that is less than 1 away
+        from it, else 0.
         """
         n_groups = 2 * self.n_dilations * self.n_groups
         size = self.group_size
@@ -275,11 +280,11 @@ class RocketEncoder(nn.Module):
     def learn(self, X: Tensor, rng: np.random.Generator) -> None:
         """Set channel scales, kernels and thresholds, in place, from traces X (n, C, T).
 
-        `rng` draws the kernels, and the traces that are read: at most 256 for the scales, and 64 of
-        these for the thresholds. A channel x is then scaled to scale * x + shift, with mean 0 and
-        deviation 1; one that never moves is only shifted. Call this method once: a second call sets
-        all of these anew, and the features of every trace change. `gain` and `offset`, which scale
-        the features, are not set here; `learn_feature_scales` sets them.
+        `rng` draws the convolution kernels, and the traces that are read: at most 256 for the
+        scales, and 64 of these for the thresholds. A channel x is then scaled to scale * x + shift,
+        with mean 0 and standard deviation 1; one that never moves is only shifted. Call this method
+        once: a second call sets all of these anew, and the features of every trace change. `gain`
+        and `offset`, which scale the features, are not set here; `learn_feature_scales` sets them.
         """
         if len(X) > SCALE_TRACES:
             X = X[torch.from_numpy(rng.permutation(len(X))[:SCALE_TRACES])]
@@ -296,14 +301,15 @@ class RocketEncoder(nn.Module):
         """Draw the kernels, and set their scales and thresholds from their outputs on traces.
 
         `x`, float32 (n, C, T), are traces whose channels the caller has scaled by `shift` and
-        `scale`, which must be set before. `rng` draws the kernels: MiniRocket's for tower 1, normal
-        weights less their mean for tower 2. It writes `kernel`, `threshold` and, if there are
-        groups, `competing_kernel`. Thresholds, which only tower 1 has, are quantiles of the
-        outputs, from 5 to 95 %. A kernel of tower 1 is scaled so that the ramp around its
-        threshold, on which its answer rises from 0 to 1, is two standard deviations of its outputs
-        wide. `threshold` holds 0.5 minus the threshold in this scale; it is added to the scaled
-        output. The kernels of tower 2 are scaled so that all outputs of a dilation together have
-        the deviation 1.
+        `scale`, which must be set before. It writes `kernel`, `threshold` and, if there are groups
+        of competing kernels, `competing_kernel`. `rng` draws the kernels of the two towers (groups
+        of features): MiniRocket's for tower 1, normal weights less their mean for tower 2.
+
+        Only tower 1 has thresholds; they are quantiles of a kernel's outputs, from 5 to 95 %. Its
+        kernels are scaled so that the ramp around the threshold, on which the answer of a kernel
+        rises from 0 to 1, is two standard deviations of the outputs wide. `threshold` holds 0.5
+        minus the threshold in this scale; it is added to the scaled output. The kernels of tower 2
+        are scaled so that all outputs of a dilation together have the standard deviation 1.
         """
         # `x` is scaled already; averaging is linear, so the scale is taken out again.
         values = self.read_taps(self.average_samples((x - self.shift) / self.scale))  # (C, taps, n)
@@ -336,10 +342,11 @@ class RocketEncoder(nn.Module):
     def learn_feature_scales(self, raw: Tensor) -> None:
         """Set `gain` and `offset` so that `offset + gain * raw` is standardised.
 
-        Both are changed in place. They are computed from the unscaled features `raw` (n, P). All
-        features of tower 2 are divided by the same standard deviation, the root mean square of
-        their standard deviations. A floor is added to each deviation, 0.001 of the median deviation
-        plus 1e-12, so that a feature that never varied does not become huge.
+        Both are changed in place. They are computed from the unscaled features `raw` (n, P), each
+        of which gets the mean 0 and the standard deviation 1. But all features of tower 2 (the
+        second group of features) are divided by the same number, the root mean square of their
+        standard deviations. A floor is added to each deviation, 0.001 of the median deviation plus
+        1e-12, so that a feature that never varied does not become huge.
         """
         deviation, mean = torch.std_mean(raw.double(), 0, unbiased=False)
         for tower in self.towers[1:]:  # of shares, those that vary more tell more
@@ -352,9 +359,9 @@ class RocketEncoder(nn.Module):
 def compute_raw_features(encoder: RocketEncoder, traces: Floats) -> Tensor:
     """Compute the unscaled features of traces (n, C, T): float32 (n, P), P features of each.
 
-    Gradients are not switched off here. The encoder computes 32 traces at a time. The features of a
-    trace are the same to the bit whatever other traces it comes with, since the last 32 are filled
-    up with traces of zeros.
+    Gradients are not switched off here. The encoder computes 32 traces at a time, and the last
+    batch is filled up with traces of zeros. So the features of a trace are the same to the bit,
+    whatever other traces it comes with.
     """
     features = []
     for chunk in torch.split(torch.from_numpy(traces), CHUNK):
@@ -375,12 +382,13 @@ def rocket_kernels() -> Tensor:
 def tap_positions(frames: int, dilations: int, places: int) -> NDArray[np.int64]:
     """Return the frame that each tap of a kernel reads, int64 (D, 9, P), for P places in a trace.
 
-    A tap is one of the nine inputs of a kernel. The places are spaced evenly over the trace, and a
-    kernel reads four inputs on each side of its place, a dilation apart. The dilations are spaced
-    evenly in their logarithm, from 1 to that at which a kernel spans the trace, and rounded down.
-    `dilations` is the largest D; D is smaller if some are then equal, as for short traces. With
-    ``dilations=1`` the only dilation is 1. For a tap beyond the ends of the trace the position is
-    ``2 * frames - 1``, at which `RocketEncoder.read_taps` finds a zero.
+    A trace has `frames` frames, means of a few samples; a tap is one of the nine inputs of a
+    kernel. The places are spaced evenly over the trace, and a kernel reads four inputs on each side
+    of its place, a dilation apart. The dilations are spaced evenly in their logarithm, from 1 to
+    that at which a kernel spans the trace, and rounded down. `dilations` is the largest D; D is
+    smaller if some are then equal, as for short traces. With ``dilations=1`` the only dilation is
+    1. For a tap beyond the ends of the trace the position is ``2 * frames - 1``, at which
+    `RocketEncoder.read_taps` finds a zero.
     """
     widest = np.log2((frames - 1) / (TAPS - 1)) if frames > TAPS else 0.0  # spans the trace
     steps = np.unique(np.floor(2.0 ** np.linspace(0.0, widest, dilations))).astype(np.int64)
@@ -392,10 +400,10 @@ def tap_positions(frames: int, dilations: int, places: int) -> NDArray[np.int64]
 def draw_kernels(channels: int, n: int, choices: Tensor, rng: np.random.Generator) -> Tensor:
     """Draw n kernels from `choices` (N, 9), and the channels that each reads: float32 (n, C * 9).
 
-    `rng` draws them. Each of the N choices is drawn n / N times, rounded up or down, so none twice
-    unless n exceeds N. A kernel reads one to all channels; a small number of channels is more
-    likely. It is the same in all channels that it reads, and 0 in the others. Each row of the
-    result has the norm 1.
+    `rng` draws them. C is `channels`. Each of the N choices is drawn n / N times, rounded up or
+    down, so none twice unless n exceeds N. A kernel reads one to all channels; a small number of
+    channels is more likely. Its nine weights are the same in all channels that it reads, and 0 in
+    the others. Each row of the result has the norm 1.
     """
     kernels = choices[torch.from_numpy(rng.permutation(max(n, len(choices)))[:n] % len(choices))]
     weights = torch.zeros(n, channels)

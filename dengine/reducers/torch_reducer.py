@@ -203,17 +203,24 @@ class TorchReducer(ProbabilityReducer):
         stop: StopRule | None = None,
         numbers: Ints | None = None,
     ) -> Floats:
-        """Train on traces (n, C, T), labels y (n,) 1 or 0, and folds (n,); replace `encoder_`.
+        """Train on traces X (n, C, T), labels y (n,) and folds (n,); return the traces' points.
 
-        It takes `n_steps_due` steps, or fewer if `stop` ends them, and starts from the weights of
-        the last training, or from initial weights the first time. `numbers` (n,), strictly
-        increasing, are label numbers that identify the traces: if `stop` allows no step, a trace
-        keeps its point of the last training, and a new trace is embedded by the unchanged
-        `encoder_`; this needs `numbers` in both trainings. Folds are not checked. Augmentation and
-        randomness are those of `fit_loop`. Returns the points of the traces, float32 (n, d), row i
-        in embedding space ``folds[i]``. Raises the errors of `check_traces`, and SettingError for
-        fewer than two traces outside a fold, and at the first training for fewer than 20 traces, or
-        a parameter, network or checkpoint that cannot be used.
+        Labels are 1 or 0. Copy k of the network is trained without the labels of fold k, one of K
+        fixed groups of traces; folds are 0 to K - 1, which is not checked. The training starts from
+        the weights of the last training, or from initial weights the first time, and takes as many
+        steps as `n_steps_due` says, or fewer if `stop` (a limit on their number, a deadline, or
+        both) ends them. Afterwards a new module `encoder_` embeds traces. Augmentation and
+        randomness are those of `fit_loop`.
+
+        `numbers` (n,), strictly increasing, are the numbers of the labels, which identify the
+        traces. If `stop` allows no step at all, and this and the last training have `numbers`,
+        `encoder_` stays: a trace keeps its point of the last training, and a new trace is embedded
+        by it.
+
+        The points are float32 (n, d), row i in embedding space ``folds[i]``, the one of copy
+        ``folds[i]``. Raises the errors of `check_traces`, and SettingError for fewer than two
+        traces outside a fold, and at the first training for fewer than 20 traces, or a parameter,
+        network or checkpoint that cannot be used. Raises ValueError for a negative `random_state`.
         """
         traces = self._check_and_initialize(X)
         return self._train(
@@ -240,8 +247,9 @@ class TorchReducer(ProbabilityReducer):
     def _initialize(self, traces: Floats) -> None:
         """Build preprocessor, networks and `encoder_` anew for traces (n, C, T).
 
-        Earlier trainings are discarded; no label is read. The preprocessor averages and scales the
-        samples; its scales are computed from the traces. The weights are read from the checkpoint,
+        `encoder_` is the module that embeds traces. Earlier trainings are discarded; no label is
+        read. The preprocessor averages and scales the samples; its scales are computed from the
+        traces. The weights of the networks are read from the checkpoint, a file of stored weights,
         if one is given, and otherwise drawn from the seed. At the end `is_initialized_` becomes
         True. Raises SettingError for a checkpoint that cannot be used, with `is_initialized_`
         False, and the errors of `_build`, which leave it as it was.
@@ -258,14 +266,15 @@ class TorchReducer(ProbabilityReducer):
     def _build(self, channels: int, samples: int, average: int, seed: int | None = None) -> None:
         """Build preprocessor and networks for traces of this shape, with initial weights.
 
-        The counts of steps, the loss, `why_no_module_` and the state of the optimiser are reset,
-        and `is_initialized_` becomes False. The caller then sets scales and weights of a
-        checkpoint, makes `encoder_`, the module that embeds, and sets `is_initialized_` to True.
-        `average` is the number of samples that are averaged to one. Without `seed` the seed comes
-        from `random_state`; torch's global generator keeps its state. Raises SettingError for a
-        parameter out of its range, fewer than 2 samples, a `random_state` of another type, or a
-        network that `Members` refuses, like one that does not give (B, features). The first two
-        change nothing; after the others do not use the reducer.
+        The networks are K copies of one, `members_`, and copies of these for the averages of their
+        weights. The counts of steps, the loss, `why_no_module_` (why there is no module to export)
+        and the state of the optimiser are reset, and `is_initialized_` becomes False. The caller
+        then sets scales and weights of a checkpoint, makes `encoder_`, the module that embeds, and
+        sets `is_initialized_` to True. `average` is the number of samples that are averaged to one.
+        Without `seed` the seed comes from `random_state`; torch's global generator keeps its state.
+        Raises SettingError for a parameter out of its range, fewer than 2 samples, a `random_state`
+        of another type, or a network that cannot be used, like one that does not give (B,
+        features). The first two errors change nothing; after the others do not use the reducer.
         """
         self.check()
         if samples < 2:
@@ -302,17 +311,23 @@ class TorchReducer(ProbabilityReducer):
         steps: int,
         numbers: Ints | None = None,
     ) -> Floats:
-        """Take `steps` steps on traces (n, C, T), or fewer if `stop` ends them; replace `encoder_`.
+        """Take up to `steps` steps on traces (n, C, T); return the points of the traces.
 
-        `fit_loop` takes the steps, and its docstring says what they change. Then the networks with
-        averaged weights and new statistics of batch normalisation become `encoder_`. But if `stop`
-        allows no step, and this and the last training have `numbers` (n,), `encoder_` stays: traces
-        of the last training, found by number, keep their points, others are embedded by `encoder_`;
-        `n_new_steps_` becomes 0 and `loss_` NaN. `n_steps_left_` becomes 0 if `stop.max_steps` is
-        set, else the number of steps that are missing until training is complete. `labels` (n,) are
-        1 or 0, `folds` (n,) the folds, 0 to K - 1. Returns the points of the traces, float32 (n,
-        d), row i in embedding space ``folds[i]``. Raises SettingError for fewer than two traces
-        outside a fold; `encoder_` and the counts of steps stay then.
+        `labels` (n,) are 1 or 0, `folds` (n,) the folds, 0 to K - 1: fixed groups of traces.
+        `fit_loop` trains copy k of the network on the rows outside fold k; its docstring says what
+        it changes. Then a copy of the networks with averaged weights and new statistics of batch
+        normalisation becomes `encoder_`, the module that embeds. `stop` (a limit on the number of
+        steps, a deadline, or both) may end the steps earlier.
+
+        But if `stop` allows no step at all, and this and the last training have `numbers` (n,), the
+        increasing numbers of the labels, `encoder_` stays: traces of the last training, found by
+        number, keep their points, and others are embedded by `encoder_`; `n_new_steps_` becomes 0
+        and `loss_` NaN. In both cases `n_steps_left_` becomes 0 if `stop.max_steps` is set, else
+        the number of steps that are missing until training is complete.
+
+        The points are float32 (n, d), row i in embedding space ``folds[i]``, the one of copy
+        ``folds[i]``. Raises SettingError for fewer than two traces outside a fold; `encoder_` and
+        the counts of steps stay then.
         """
         if numbers is not None and self._points.numbers is not None and stop.exhausted(0):
             self.n_new_steps_ = 0
@@ -344,12 +359,13 @@ class TorchReducer(ProbabilityReducer):
     def fit_loop(self, x: Tensor, y: Tensor, folds: Ints, stop: StopRule, steps: int) -> None:
         """Take AdamW steps on augmented batches, copy k of the network on the rows outside fold k.
 
-        It changes `members_`, the K copies, and the running averages of their weights in place,
-        goes on from the optimiser's stored moments, and stores the new ones. `n_new_steps_` becomes
-        the number of steps taken, by which `n_steps_` grows, and `loss_` their mean loss (NaN if no
-        step is taken). Batches, augmentation (`Augmentation`) and dropout follow from `seed_` and
-        `n_steps_`; torch's global generator keeps its state. `encoder_`, the module that embeds,
-        stays as it is. Afterwards `members_` is in training mode.
+        A fold is one of K fixed groups of rows. This changes `members_`, the K copies, and the
+        running averages of their weights in place, goes on from the optimiser's stored moments, and
+        stores the new ones. `n_new_steps_` becomes the number of steps taken, by which `n_steps_`
+        grows, and `loss_` their mean loss (NaN if no step is taken). Batches, augmentation
+        (`Augmentation`) and dropout follow from `seed_` and `n_steps_`; torch's global generator
+        keeps its state. `encoder_`, the module that embeds, stays as it is. Afterwards `members_`
+        is in training mode.
 
         Parameters
         ----------
@@ -358,8 +374,9 @@ class TorchReducer(ProbabilityReducer):
         y : Tensor of float32, shape (n,)
             Labels, 1 or 0.
         folds : array of int64, shape (n,)
+            Fold of each row, 0 to K - 1.
         stop : StopRule
-            Asked before each step.
+            Limit on the number of steps, a deadline, or both; asked before each step.
         steps : int
             Largest number of steps.
 
@@ -387,10 +404,11 @@ class TorchReducer(ProbabilityReducer):
     def train_step(self, optimizer: torch.optim.Optimizer, x: Tensor, y: Tensor) -> float:
         """Take one step on traces x (B, K, C', L), labels y (B, K); return the loss, in nats.
 
-        `optimizer` is that of `make_optimizer`. `members_`, with its statistics of batch
-        normalisation, and the averaged weights change in place, and `n_steps_` grows by 1. Dropout
-        draws from torch's global generator, if `members_` is in training mode. The loss is the one
-        before the step, the mean over the batch and over the K copies of the network; each copy
+        `optimizer` is that of `make_optimizer`. `members_`, the K copies of the network, with their
+        statistics of batch normalisation, and the running averages of their weights change in
+        place, and `n_steps_` grows by 1. Copy k sees the preprocessed traces and the labels at
+        index k. Dropout draws from torch's global generator, if `members_` is in training mode. The
+        loss is the one before the step, the mean over the batch and over the K copies; each copy
         moves by the gradient of its own mean loss.
         """
         logits = self.members_(x)  # (B, K)
@@ -406,8 +424,9 @@ class TorchReducer(ProbabilityReducer):
     def make_optimizer(self) -> torch.optim.Optimizer:
         """Return a new AdamW for `members_`, with the moments that the last training left.
 
-        The moments are the running means of gradients and of their squares. They are not copied: a
-        step of the optimiser changes `optimizer_state_`. Weight decay is only for parameters of two
+        `members_` are the copies of the network that are trained. The moments are the running means
+        of gradients and of their squares. They are not copied: a step of the optimiser changes
+        `optimizer_state_`, in which they are stored. Weight decay is only for parameters of two
         dimensions or more whose name ends in "weight", so not for biases and batch normalisation.
         """
         parameters: dict[bool, list[nn.Parameter]] = {True: [], False: []}  # by whether they decay
@@ -427,11 +446,12 @@ class TorchReducer(ProbabilityReducer):
 
     @torch.no_grad()
     def average_weights(self) -> None:
-        """Move the parameters of `averaged_members_`, in place, towards those of `members_`.
+        """Move the averaged weights of the networks, in place, towards the trained weights.
 
-        An averaged parameter becomes `weight_averaging` times itself plus the rest of the trained
-        one; in the first steps the factor is smaller, (1 + n) / (10 + n), where n is `n_steps_`.
-        Statistics of batch normalisation are not averaged.
+        Each parameter of `averaged_members_` becomes ``c * average + (1 - c) * trained``, where
+        `trained` is that of `members_`, and c is `weight_averaging`. In the first steps c is
+        smaller, (1 + n) / (10 + n), where n is `n_steps_`. Statistics of batch normalisation are
+        not averaged.
         """
         kept = min(self.weight_averaging, (1 + self.n_steps_) / (10 + self.n_steps_))
         for average, current in zip(
@@ -443,11 +463,12 @@ class TorchReducer(ProbabilityReducer):
     def estimate_statistics(self, x: Tensor) -> None:
         """Estimate the running statistics of batch normalisation anew, for the averaged weights.
 
-        This is what `torch.optim.swa_utils.update_bn` does. At most 256 of the preprocessed traces
-        x (n, C', L) are read; they are drawn with the seed n. The statistics are the means of those
-        of batches of at most 64. No label is read, so each copy of the network may see all folds.
-        Other buffers are copied from `members_`. Afterwards `averaged_members_` is in evaluation
-        mode.
+        `averaged_members_`, the networks with these weights, are changed in place, as by
+        `torch.optim.swa_utils.update_bn`. At most 256 of the preprocessed traces x (n, C', L) are
+        read; they are drawn with the seed n. The statistics are the means of those of batches of at
+        most 64. No label is read, so each copy of the network may see all traces. Other buffers are
+        copied from the trained networks, `members_`. Afterwards `averaged_members_` is in
+        evaluation mode.
         """
         members = self.averaged_members_.eval()
         for buffer, trained in zip(members.buffers(), self.members_.buffers(), strict=True):
@@ -472,9 +493,11 @@ class TorchReducer(ProbabilityReducer):
     def _embed_in_fold_space(self, x: Tensor, folds: Ints) -> Floats:
         """Embed preprocessed traces (n, C', L), each in one embedding space: float32 (n, d).
 
-        Row i is the point of trace i in space ``folds[i]``. Folds must be 0 to K - 1, which is not
-        checked; rows of other folds are undefined. Network k computes the rows of fold k alone, so
-        this takes 1 / K of the time of `embed` if the folds are equally large.
+        There are K spaces; space k is that of copy k of the network, which is trained without the
+        labels of fold k, a fixed group of traces. Row i is the point of trace i in space
+        ``folds[i]``. Folds must be 0 to K - 1, which is not checked; rows of other folds are
+        undefined. Copy k embeds the rows of fold k alone, so this takes 1 / K of the time of
+        `embed` if the folds are equally large.
         """
         rows_of_fold = [torch.from_numpy(np.flatnonzero(folds == k)) for k in range(self.folds)]
         points = torch.empty(len(x), self.n_components)
@@ -502,9 +525,10 @@ class TorchReducer(ProbabilityReducer):
         """Return the module that embeds, (B, C, T) -> (B, K, d), for compiling or exporting.
 
         It is the present `encoder_`, which later trainings replace and do not change. None if
-        TorchScript cannot compile the network: the first call finds this out, and logs a warning,
-        unless a warning for this network and shape was logged before (`compile_fault`). Raises
-        NotFittedError before there are networks, and TypeError if `network` is not hashable.
+        TorchScript cannot compile the user's network: the first call finds this out, and logs a
+        warning, unless a warning for this network and shape was logged before (`compile_fault`).
+        Raises NotFittedError before there are networks, and TypeError if the parameter `network`,
+        the class or function that makes one, is not hashable.
         """
         check_is_fitted(self, "encoder_")
         if self.why_no_module_ is None:  # copies of the reducer, which an engine trains, keep it
@@ -518,10 +542,10 @@ class TorchReducer(ProbabilityReducer):
         """Return the report of the last training: its steps, the steps still missing, and a note.
 
         Training is complete after 36 steps plus 1.2 for each label, but at most `fit_steps`, over
-        all trainings. If the caller limited the steps of the last training, none counts as missing.
-        The note gives the loss and the number of all steps so far if the last training took a step,
-        and the number of missing steps if there are any. If neither holds, it is "". Raises
-        NotFittedError before there are networks.
+        all trainings. If the caller limited the number of steps of the last training, none counts
+        as missing. The note gives the loss and the number of all steps so far if the last training
+        took a step, and the number of missing steps if there are any. If neither holds, it is "".
+        Raises NotFittedError before there are networks.
         """
         check_is_fitted(self, "encoder_")
         note = f"loss {self.loss_:.3f} after {self.n_steps_} steps" if self.n_new_steps_ else ""
@@ -532,9 +556,10 @@ class TorchReducer(ProbabilityReducer):
     def get_state(self) -> State:
         """Return arrays from which `set_state` restores the reducer bit for bit, by name.
 
-        They are shape, counters, loss, and the tensors of preprocessor, networks, averaged networks
-        and optimiser, so that training can go on. They include the points of a fixed trace, by
-        which `set_state` recognises the network. Raises NotFittedError before there are networks.
+        They are the shape of the traces, counters, the loss, and the tensors of the preprocessor,
+        of the networks, of their copies with averaged weights, and of the optimiser, so that
+        training can go on. They include the points of a fixed trace, by which `set_state`
+        recognises the network. Raises NotFittedError before there are networks.
         """
         check_is_fitted(self, "encoder_")
         state = {
@@ -562,12 +587,13 @@ class TorchReducer(ProbabilityReducer):
         """Restore what `get_state` returned, and return self.
 
         The constructor's parameters must be the same. A tensor that the state lacks keeps its
-        initial value, since earlier releases stored fewer. Raises StoreError if the sizes are
-        others, if the state has a tensor that the modules lack, or if the network gives points for
-        a fixed trace that differ by more than 0.001 from those when the state was taken; a state
-        without these points is not checked so. Raises KeyError if an array of counts, shape or loss
-        is missing, and SettingError for a parameter or network that cannot be used. The sizes of
-        the optimiser's tensors are not checked. After an error do not use the reducer.
+        initial value, since earlier releases stored fewer. Raises StoreError if a tensor has
+        another size than in the modules, if the state has a tensor that the modules lack, or if the
+        network gives points for a fixed trace that differ by more than 0.001 from those when the
+        state was taken; a state without these points is not checked so. Raises KeyError if an array
+        of counts, shape or loss is missing, and SettingError for a parameter or network that cannot
+        be used. The sizes of the optimiser's tensors are not checked. After an error do not use the
+        reducer.
         """
         channels, samples = self.restore_shape(state)
         average, seed, *counts = map(int, state["counts"])
@@ -588,10 +614,10 @@ class TorchReducer(ProbabilityReducer):
         return self
 
     def _modules(self) -> dict[str, nn.Module]:
-        """Return the modules whose tensors `get_state` returns.
+        """Return the modules whose tensors `get_state` returns, by the prefix of their names.
 
-        They are the preprocessor, the trained copies of the network and their averages. The keys
-        are the prefixes of the names of these tensors in the state.
+        They are the preprocessor ("preprocessor."), the trained copies of the network ("members.")
+        and the copies with averaged weights ("averaged.").
         """
         return {
             "preprocessor.": self.preprocessor_,
@@ -603,7 +629,8 @@ class TorchReducer(ProbabilityReducer):
     def _embed_ramp(self) -> Floats:
         """Return the points (1, K, d) of a fixed trace, by which `set_state` knows the network.
 
-        It is a preprocessed trace whose channels rise from -1 to 1.
+        There is a point for each of the K copies of the network. The trace is a preprocessed one,
+        whose channels all rise from -1 to 1.
         """
         channels = self.preprocessor_.channels
         samples = self.preprocessor_.samples
@@ -613,12 +640,12 @@ class TorchReducer(ProbabilityReducer):
     def check(self) -> None:
         """Raise SettingError for a parameter out of its range.
 
-        Integers are folds from 2 to 1000, batch_size of at least 2, steps and fit_steps of at least
-        1, shift of at least 0 (these four up to a million), and n_components, 1 or 2. The other
-        numbers are learning_rate, weight_averaging, weight_decay, gain, noise and mixup. None of
-        them is negative, infinite or NaN; besides, learning_rate is not 0, and weight_averaging is
-        below 1. checkpoint is a text or path; no file is looked at. The other parameters are not
-        checked.
+        These parameters must be integers: folds from 2 to 1000, batch_size of at least 2, steps and
+        fit_steps of at least 1, shift of at least 0 (these four up to a million), and n_components,
+        1 or 2. The numbers learning_rate, weight_averaging, weight_decay, gain, noise and mixup
+        must not be negative, infinite or NaN; besides, learning_rate must not be 0, and
+        weight_averaging must be below 1. checkpoint must be a text or path; no file is looked at.
+        The other parameters are not checked.
         """
         check_integers(
             self,
@@ -650,17 +677,18 @@ def draw_batches(
 ) -> Iterator[Tensor]:
     """Yield, for each step, the rows on which each of K networks is trained.
 
-    Network k passes over all rows outside fold k in random order, and then again in another order;
-    a batch may span two passes.
+    Network k passes over all rows outside fold k, a fixed group of rows, in random order, and then
+    again in another order; a batch may span two passes.
 
     Parameters
     ----------
     folds : array of int, shape (n,)
-        Network k gets no row of fold k.
+        Fold of each row. Network k gets no row of fold k.
     n_folds, batch_size, steps : int
-        K, B and the number of batches, which is at least 1. If a network has fewer than B rows, B
-        is reduced to the smallest number of rows of a network.
+        K, B and the number of batches, which must be at least 1. If a network has fewer than B
+        rows, B is reduced to the smallest number of rows of a network.
     rng : numpy.random.Generator
+        Draws the orders.
 
     Yields
     ------
@@ -710,11 +738,12 @@ def standard_normal(rng: np.random.Generator, *shape: int) -> Tensor:
 def compile_fault(network: NetworkFactory, channels: int, samples: int) -> str:
     """Return why TorchScript cannot compile a network, and log it as a warning; "" if it can.
 
-    A user's network may hold Python that TorchScript does not support. To find out, two copies of
-    it for preprocessed traces (channels, samples) are built, compiled and run; any exception counts
-    as a fault, and none is raised, but TypeError if `network` is not hashable. A process keeps the
-    answers for the last 32 networks and shapes, and logs nothing when it gives such an answer
-    again. The state of torch's global random generator does not change.
+    ``network(channels, samples)`` makes a module for preprocessed traces of this shape. A user's
+    network may hold Python that TorchScript does not support. To find out, two copies of it are
+    built, compiled and run; any exception counts as a fault, and none is raised, but TypeError if
+    `network` is not hashable. A process keeps the answers for the last 32 networks and shapes, and
+    logs nothing when it gives such an answer again. The state of torch's global random generator
+    does not change.
     """
     try:
         with torch.random.fork_rng(devices=[]), torch.inference_mode():

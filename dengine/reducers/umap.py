@@ -135,10 +135,11 @@ class UmapEncoder(nn.Module):
     def embed_frames(self, frames: Tensor) -> Tensor:
         """Embed traces, each a vector of F frames, among the references: (B, F) -> (B, dim).
 
-        A trace starts at the mean of the points of its `n_neighbors` nearest references, weighted
-        by their membership strengths. It is then moved five times to the mean of the same points,
-        weighted by how strongly UMAP attracts it to each of them at its current distances (whose
-        squares are raised by 0.001).
+        A frame is a scaled sum of a few samples; the references are the traces of the training,
+        whose frames and points the module holds. A trace starts at the mean of the points of its
+        `n_neighbors` nearest references, weighted by their membership strengths (`strengths`). It
+        is then moved five times to the mean of the same points, weighted by how strongly UMAP
+        attracts it to each of them at its current distances (whose squares are raised by 0.001).
         """
         # Half the squared distances, less half the squared norm of each trace.
         half_squared = self.half_norms - frames @ self.references.T
@@ -154,13 +155,14 @@ class UmapEncoder(nn.Module):
         return embedded
 
     def strengths(self, distances: Tensor) -> Tensor:
-        """Distances to the nearest references (B, n_neighbors) -> membership strengths, same shape.
+        """Compute the membership strengths of nearest references from their distances.
 
-        A strength is ``exp(-beyond / sigma)``, where `beyond` is the distance less that of the
-        nearest reference; so it is 1 for the nearest. sigma is chosen for each row, from 0.001 to
-        100 times the row's mean of `beyond`, so that the strengths sum to about
-        ``log2(n_neighbors)``, as far as this range allows; if all distances of a row are equal,
-        all are 1.
+        The distances are (B, n_neighbors), a row for each trace, and so is the result; references
+        are the traces of the training. A strength is ``exp(-beyond / sigma)``, where `beyond` is
+        the distance less that of the nearest reference; so it is 1 for the nearest. sigma is chosen
+        for each row, from 0.001 to 100 times the row's mean of `beyond`, so that the strengths sum
+        to about ``log2(n_neighbors)``, as far as this range allows; if all distances of a row are
+        equal, all strengths are 1.
         """
         beyond = distances - distances.amin(1, keepdim=True)
         beyond = beyond / (beyond.mean(1, keepdim=True) + 1e-12)
@@ -247,7 +249,9 @@ class UmapReducer(Reducer):
     random_state: Any = 0
 
     def fit(self, X: ArrayLike, y: ArrayLike | None = None) -> Self:
-        """Start anew and take `n_epochs` epochs, by default the 200 of a first layout.
+        """Compute a UMAP layout of traces anew, in `n_epochs` epochs, by default 200.
+
+        The layout has a point for each trace. Earlier trainings are discarded.
 
         Parameters
         ----------
@@ -283,18 +287,22 @@ class UmapReducer(Reducer):
         stop: StopRule | None = None,
         numbers: Ints | None = None,
     ) -> Floats:
-        """Compute a layout of traces X (n, C, T), and make them the references of a new `encoder_`.
+        """Compute a layout of traces X (n, C, T), and embed by it from now on; return its points.
 
-        `numbers` (n,), those of the labels, increasing, identify the traces from training to
-        training; labels and folds are not read. The layout goes on from the last one if at least
-        half of the traces were in it; otherwise, or without `numbers`, it starts anew; if none of
-        them was in the last search of neighbours, or without `numbers`, the seed and the frames are
-        new as well. It takes `n_epochs_due` epochs, or fewer if `stop` ends them; after the
-        deadline of `stop` at most ten more are taken. What `precompute` found is used, unless seed
-        and frames are new, and then dropped. Returns the points of the traces, float32 (n,
-        n_components), which share their memory with `embedding_`. Raises the errors of
-        `check_traces`, SettingError for a parameter out of its range, a `random_state` of another
-        type or too few traces, and ValueError for a negative `random_state`.
+        The layout has a point for each trace. A new module `encoder_` places later traces among
+        these. `numbers` (n,), the increasing numbers of the labels, identify the traces from
+        training to training; labels and folds are not read. If at least half of the traces were in
+        the last layout, the new one goes on from it. Otherwise, or without `numbers`, it starts
+        anew. If none of the traces was in the last search of neighbours, or without `numbers`, a
+        new seed is drawn as well, and the frames, sums of samples between which distances are
+        measured, are set up anew.
+
+        `n_epochs_due` epochs are taken, or fewer if `stop` (a limit on their number, a deadline, or
+        both) ends them; after its deadline at most ten more are taken. What `precompute` found is
+        used, unless seed and frames are new, and then dropped. The points are float32 (n,
+        n_components) and share their memory with `embedding_`. Raises the errors of `check_traces`,
+        SettingError for a parameter out of its range, a `random_state` of another type or too few
+        traces, and ValueError for a negative `random_state`.
         """
         traces = self._check(X, reset=not self._is_fitted)
         if numbers is None or not self._has_searched_any(numbers):
@@ -306,11 +314,12 @@ class UmapReducer(Reducer):
         """Return the number of epochs that the next `train` takes on `n_traces` traces.
 
         If `n_epochs` was given, it is that, without a limit. Otherwise it is the number of epochs
-        that are missing to the first 200; if none is missing, it is 240,000 / n_traces but at least
-        60. Either of these numbers is then limited to 200, and to 400,000 / n_traces but at least
-        1; quotients are rounded down. `train` takes fewer if its `stop` ends it, and counts the
-        first 200 from 0 again if more than half of its traces are new or it gets no numbers. Before
-        the first training or `precompute` AttributeError is raised, unless `n_epochs` was given.
+        that are missing to the 200 that a first layout needs; if none is missing, it is 240,000 /
+        n_traces but at least 60. Either of these numbers is then limited to 200, and to 400,000 /
+        n_traces but at least 1; quotients are rounded down. `train` takes fewer if its `stop` ends
+        it, and counts the first 200 from 0 again if more than half of its traces are new or it gets
+        no numbers. Before the first training or `precompute` AttributeError is raised, unless
+        `n_epochs` was given.
         """
         if self.n_epochs is not None:
             return self.n_epochs
@@ -323,8 +332,8 @@ class UmapReducer(Reducer):
         `train` finds them again by `numbers`, the numbers of the traces' labels; without numbers
         nothing is done. Before the first training each call also sets the shape, draws the seed and
         sets up new frames, the sums of samples between which distances are measured. Raises the
-        errors of `check_traces`, and SettingError for a parameter out of its range, or too few
-        traces.
+        errors of `check_traces`, and SettingError for a parameter out of its range, a
+        `random_state` of another type, or too few traces.
         """
         if numbers is None:
             return
@@ -340,10 +349,11 @@ class UmapReducer(Reducer):
         return "encoder_" in vars(self)
 
     def _has_searched_any(self, numbers: Ints) -> bool:
-        """Return whether a trace with one of these label numbers was in the last neighbour search.
+        """Return whether one of these traces was in the last search of neighbours.
 
-        The last search is the one of `precompute`, or without that the one of the last training.
-        False if there was no search.
+        The traces are identified by the numbers of their labels, `numbers`. The last search is that
+        of `precompute`, if no training came after it, else that of the last training. False if
+        there was none.
         """
         if "neighbors_" not in vars(self):
             return False
@@ -354,10 +364,11 @@ class UmapReducer(Reducer):
     def _initialize(self, traces: Floats) -> None:
         """Discard all trainings, draw the seed, and set up the frames of traces (n, C, T).
 
-        `random_state` gives the seed; the counters of epochs become 0. A frame is the sum of a
-        short stretch of samples. The number of frames of a trace and their centre and scale come
-        from at most 256 of the traces, evenly spaced. An earlier `encoder_` stays until the next
-        training replaces it. Raises SettingError for a `random_state` of another type.
+        `random_state` gives the seed; the counters of epochs become 0. A frame is the scaled sum of
+        a short stretch of samples. The number of frames of a trace and their centre and scale come
+        from at most 256 of the traces, evenly spaced. An earlier `encoder_`, the module that
+        embeds, stays until the next training replaces it. Raises SettingError for a `random_state`
+        of another type.
         """
         sample = traces[:: 1 + len(traces) // CHUNK]
         self.make_frames_ = frames_for(sample)
@@ -376,14 +387,16 @@ class UmapReducer(Reducer):
         stop: StopRule,
         n_epochs: int | None = None,
     ) -> None:
-        """Train on traces (n, C, T) with their labels' numbers, and make a new `encoder_`.
+        """Compute a layout of traces (n, C, T), and embed by it from now on.
 
-        It finds neighbours (from those of `precompute` or of the last training), joins them to a
-        graph, and moves the points for `n_epochs` epochs (None: `n_epochs_due`), or fewer if `stop`
-        ends them. Without numbers all traces count as new. If more than half of them are new, the
-        layout starts anew, and `n_epochs_` from 0. Neighbours, points and encoder are replaced,
-        what `precompute` found is dropped, and the counters of epochs grow. Noise and negative
-        samples follow from `seed_` and `n_steps_`.
+        `numbers` (n,), the increasing numbers of the labels, identify the traces. It finds
+        neighbours (from those of `precompute` or of the last training), joins them to a graph, and
+        moves the points of the traces for `n_epochs` epochs (None: `n_epochs_due`), or fewer if
+        `stop`, a limit on their number or a deadline, ends them. Without numbers all traces count
+        as new. If more than half of them are new, the layout starts anew, and `n_epochs_` from 0.
+        Neighbours, points and `encoder_`, the module that embeds, are replaced, what `precompute`
+        found is dropped, and the counters of epochs grow. Noise and negative samples (random points
+        that repel) follow from `seed_` and `n_steps_`. Raises ValueError for a negative seed.
         """
         if numbers is None:
             numbers = np.arange(-len(traces), 0)  # numbers that no label has
@@ -411,9 +424,10 @@ class UmapReducer(Reducer):
         """Return the points (n, n_components), float32, at which a layout starts.
 
         `neighbors` and `graph` are those of the n traces; `rng` draws the noise. If at least half
-        of the traces were in the last training, they start at their last points, and a new trace
+        of the traces were in the last training, these start at their last points, and a new trace
         starts where the last `encoder_` puts it, plus noise with a standard deviation of 0.0001.
-        Otherwise all start at the points of `spectral_start`, and `n_epochs_` becomes 0.
+        Otherwise all start at the points of `spectral_start` (from eigenvectors of the graph), and
+        `n_epochs_` becomes 0.
         """
         last_rows = self.neighbors_.rows_of(neighbors.numbers)
         is_old = last_rows >= 0
@@ -429,10 +443,12 @@ class UmapReducer(Reducer):
         return points
 
     def _set_references(self, neighbors: Neighbors, points: Tensor) -> None:
-        """Make traces and their points (n, n_components) the references of a new encoder.
+        """Make traces and their points (n, n_components) the references of a new `encoder_`.
 
-        `neighbors` holds the frames of the traces and their nearest neighbours. This replaces
-        `neighbors_`, `embedding_` and `encoder_`, and drops what `precompute` found.
+        `encoder_` is the module that embeds: it places a trace among its references. `neighbors`
+        holds the frames (scaled sums of samples) of the traces and their nearest neighbours. This
+        replaces `neighbors_`, `embedding_` (the points) and `encoder_`, and drops what `precompute`
+        found.
         """
         self.neighbors_ = neighbors
         self.precomputed_neighbors_ = None
@@ -453,8 +469,9 @@ class UmapReducer(Reducer):
     def untrained_module(self, X: Floats) -> UmapEncoder:
         """Return a module that can be compiled before the training on traces X (n, C, T).
 
-        After a first training it is the present `encoder_` itself. Before, it is a new encoder
-        whose references are all 0; no parameter is checked for it, and nothing is kept.
+        After a first training it is the present `encoder_` itself, the module that embeds. Before,
+        it is a new one, whose references (the traces among which it places others) are all 0; no
+        parameter is checked for it, and nothing is kept.
         """
         if self._is_fitted:
             return self.encoder_
@@ -502,10 +519,11 @@ class UmapReducer(Reducer):
     def get_state(self) -> State:
         """Return arrays from which `set_state` restores the reducer bit for bit, by name.
 
-        They are the shape of the traces, the centre and scale of `Frames`, the seed, the counts of
-        frames and epochs, and of the last training the numbers (of the labels), frames, neighbours,
-        distances and points. Not all of them are copies. Neighbours that `precompute` found are not
-        among them. Raises NotFittedError before a fit.
+        They are the shape of the traces, the centre and scale of the frames (the scaled sums of
+        samples between which distances are measured), the seed, and the counts of frames and
+        epochs. Of the traces of the last training they are the numbers of the labels, the frames,
+        the neighbours and their distances, and the points. Not all of them are copies. Neighbours
+        that `precompute` found are not among them. Raises NotFittedError before a fit.
         """
         check_is_fitted(self, "encoder_")
         return module_state(self.make_frames_, "frames.") | {
@@ -527,12 +545,13 @@ class UmapReducer(Reducer):
         }
 
     def set_state(self, state: Arrays) -> Self:
-        """Restore what `get_state` returned, and return self; the parameters must be the same.
+        """Restore what `get_state` returned, and return self.
 
-        What `precompute` found is dropped. Raises StoreError if the arrays of `Frames`, the module
-        that averages traces, are missing or have other sizes than the shape of the traces in
-        `state` asks for, and KeyError if another array is missing; the reducer may be partly
-        changed by then. The parameters are not compared with the state.
+        The constructor's parameters must be the same; they are not compared with the state. What
+        `precompute` found is dropped. Raises StoreError if the arrays of `Frames`, the module that
+        shortens traces, are missing or have other sizes than the shape of the traces in `state`
+        asks for, and KeyError if another array is missing; the reducer may be partly changed by
+        then.
         """
         channels, samples = self.restore_shape(state)
         n_frames, *counts = map(int, state["counts"])
@@ -551,7 +570,7 @@ class UmapReducer(Reducer):
         return self
 
     def _check(self, X: ArrayLike, reset: bool) -> Floats:
-        """Check traces and parameters, and return the traces as `check_traces` does.
+        """Check traces and parameters; return the traces as float32 (n, C, T).
 
         With `reset` the traces set the shape that later ones must have, even if a parameter is
         refused.

@@ -113,7 +113,8 @@ class Neighbors:
     def empty(cls, n_features: int, k: int) -> Self:
         """Return an object without traces, whose `update` finds k neighbours of each trace.
 
-        `n_features` is F, the number of frames (sums of short stretches of samples) of a trace.
+        `n_features` is F, the number of frames of a trace: the sums of short stretches of samples
+        between which distances are measured.
         """
         return cls(
             numbers=np.zeros(0, dtype=np.int64),
@@ -141,7 +142,7 @@ class Neighbors:
         Parameters
         ----------
         traces : array of float32, shape (n, C, T)
-            More than k.
+            More than k, the number of neighbours of a trace.
         numbers : array of int64, shape (n,)
             Numbers of the labels, increasing; the same number stands for the same trace as before.
             A trace of this object whose number is not among them is dropped.
@@ -258,12 +259,12 @@ def membership_strengths(distances: Tensor, n_neighbors: int) -> Tensor:
     """Compute the membership strengths of the neighbours of each trace.
 
     A strength is ``exp(-(distance - rho) / sigma)``, but at most 1. rho is the distance to the
-    nearest neighbour that is not identical. sigma is chosen such that the strengths of a trace sum
-    to ``log2(n_neighbors)``, but it is at least 0.001 of the mean distance to the neighbours, with
-    the trace itself at 0 (over all traces, if rho is 0 because all neighbours are identical); the
-    sum is also larger if many neighbours are as near as rho. The method is that of
-    `smooth_knn_dist` and `compute_membership_strengths` in umap-learn, with 1 for its parameter
-    `local_connectivity`.
+    nearest neighbour that is not identical, or 0 if all are. sigma is chosen such that the
+    strengths of a trace sum to ``log2(n_neighbors)``. But it is at least 0.001 of the trace's mean
+    distance, in which the trace itself counts as a neighbour at 0, or of the mean of this over all
+    traces if rho is 0. The sum is larger if sigma is at this limit, or if many neighbours are as
+    near as rho. The method is that of `smooth_knn_dist` and `compute_membership_strengths` in
+    umap-learn, with 1 for its parameter `local_connectivity`.
 
     Parameters
     ----------
@@ -301,8 +302,9 @@ def membership_strengths(distances: Tensor, n_neighbors: int) -> Tensor:
 def fuzzy_simplicial_set(indices: Tensor, strengths: Tensor) -> csr_matrix:
     """Unite the neighbourhoods of all traces to one symmetric graph.
 
-    An edge has the strength ``p + q - p * q``, where p and q are the strengths in its two
-    directions; a direction that is missing has strength 0.
+    An edge joins two traces of which one is a neighbour of the other. It has the strength ``p + q -
+    p * q``, where p and q are the strengths in its two directions; a direction that is missing has
+    strength 0.
 
     Parameters
     ----------

@@ -46,15 +46,16 @@ def spectral_start(
 ) -> Tensor:
     """Place traces by eigenvectors of their graph, as the start of a layout.
 
-    They are the eigenvectors of the normalised Laplacian with the smallest eigenvalues, without
-    the first. Principal components of the frames take their place if the graph is not connected,
-    because eigenvectors then say nothing of the points within a component, and if the solver does
-    not converge. umap-learn places each component by eigenvectors of its own.
+    They are the eigenvectors of the normalised Laplacian with the smallest eigenvalues, without the
+    first. Principal components of the frames take their place in two cases: if the graph is not
+    connected, because eigenvectors then say nothing of the points within a connected component, and
+    if the solver does not converge. umap-learn places each connected component by eigenvectors of
+    its own.
 
     Parameters
     ----------
     graph : csr_matrix of float32, shape (n, n)
-        The fuzzy simplicial set.
+        The fuzzy simplicial set: weights of the edges between neighbours.
     frames : Tensor of float32, shape (n, F)
         Averages of each trace over stretches of samples (`umap_graph.Frames`), for the principal
         components.
@@ -93,9 +94,9 @@ def leading_eigenvectors(
     """Compute n eigenvectors of D^(-1/2) A D^(-1/2), where A is the graph and D its degrees.
 
     They belong to the n largest eigenvalues after the very largest. Returns them as columns,
-    float64 (n_traces, n), in the order of increasing eigenvalues, or None if the solver does not
-    converge. `rng` draws the vector from which the solver starts; up to 200 traces (4 n, if that
-    is more) all eigenvectors are computed instead, without `rng`.
+    float64 (number of traces, n), in the order of increasing eigenvalues, or None if the solver
+    does not converge. `rng` draws the vector from which the solver starts. For up to 200 traces, or
+    up to 4 n if that is more, all eigenvectors are computed instead, without `rng`.
     """
     root = np.sqrt(np.asarray(graph.sum(1), dtype=np.float64)).ravel()
     edges = graph.tocoo()
@@ -116,8 +117,9 @@ def leading_eigenvectors(
 def principal_components(frames: Tensor, n: int) -> NDArray[np.float64]:
     """Return the first n principal components of frames (m, F), float64 (m, n).
 
-    The mean of all rows is subtracted; the axes are then computed from at most 256 of the rows,
-    evenly spaced. If there are fewer than n components, the last columns are 0.
+    `frames` has a row of F numbers for each trace. The mean of all rows is subtracted; the axes are
+    then computed from at most 256 of the rows, evenly spaced. If there are fewer than n components,
+    the last columns are 0.
     """
     centred = (frames - frames.mean(0)).double()
     axes = torch.linalg.svd(centred[:: 1 + len(centred) // PCA_TRACES], full_matrices=False).Vh[:n]
@@ -177,7 +179,8 @@ class Edges:
         """Return the edges of a symmetric graph (n, n) of points, each edge in both directions.
 
         An edge joins a point, its `head`, to another, its `tail`; row i of the graph holds the
-        strengths of the edges with head i. They are divided by the largest strength.
+        strengths of the edges with head i. The strengths are divided by the largest one. The edges
+        are in the order of their heads, and `counts` (n,) is the number of edges of each head.
         """
         counts = torch.from_numpy(np.diff(graph.indptr).astype(np.int64))
         strength = torch.from_numpy(graph.data.astype(np.float32))
@@ -211,7 +214,7 @@ def attraction(points: Tensor, edges: Edges, a: float, b: float) -> tuple[Tensor
 
     An edge pulls with the coefficient ``4 a b d^(2b - 2) / (1 + a d^(2b))`` times its strength,
     along the offset to the neighbour. Here d is the distance between the two, and d^2 counts as
-    1e-8 at least. This is the negative gradient of the edge's term in the cross entropy, twice. The
+    1e-8 at least. This is twice the negative gradient of the edge's term in the cross entropy: the
     factor is 4, not 2, since umap-learn moves both ends of an edge and holds each edge twice.
 
     Parameters
@@ -228,7 +231,8 @@ def attraction(points: Tensor, edges: Edges, a: float, b: float) -> tuple[Tensor
     pull : Tensor of float32, shape (d, n)
         Direction and size of the move; the points are not moved here.
     stiffness : Tensor of float32, shape (n,)
-        For each point the sum over its edges of coefficient times strength.
+        For each point the sum over its edges of coefficient times strength, by which the caller
+        damps the move.
 
     References
     ----------
@@ -305,11 +309,11 @@ def repulsion(points: Tensor, samples: Tensor, a: float, b: float) -> Tensor:
 def learning_rates(n_epochs: int, stop: StopRule) -> Iterator[float]:
     """Yield the learning rate of each of `n_epochs` epochs, which falls from 1 towards 0.
 
-    `stop` is asked before each epoch. If `stop` limits the number of steps, the rate falls within
-    that number. After its deadline at most ten more epochs are taken, over which the rate falls
-    quickly, in equal steps towards 0: at a high rate the points would stay scattered by the
-    negative samples of the last epoch. There are never more than `n_epochs` rates, and none if
-    `stop` limits the steps to 0.
+    `stop`, a limit on the number of epochs, a deadline, or both, is asked before each epoch. If it
+    limits the number (`max_steps`), the rate falls within that number. After its deadline at most
+    ten more epochs are taken, over which the rate falls quickly, in equal steps towards 0: at a
+    high rate the points would stay scattered by the negative samples (random points that repel) of
+    the last epoch. There are never more than `n_epochs` rates, and none if `max_steps` is 0.
     """
     if stop.max_steps is not None:
         n_epochs = min(n_epochs, stop.max_steps)
@@ -347,8 +351,9 @@ def optimize_layout(
     n_epochs : int
         Epochs to take at most. The learning rate falls from 1 towards 0 over them.
     stop : StopRule
-        Asked before each epoch. Its `max_steps` lowers `n_epochs`. After its deadline at most ten
-        more epochs are taken, over which the rate falls quickly.
+        Limit on the number of epochs, a deadline, or both; asked before each epoch. Its `max_steps`
+        lowers `n_epochs`. After its deadline at most ten more epochs are taken, over which the rate
+        falls quickly.
     generator : torch.Generator
         Draws the negative samples.
 

@@ -110,9 +110,10 @@ class UmapLearnReducer(Reducer):
         return self._transform_batch(self.check_traces(X))
 
     def embed(self, X: Floats) -> Floats:
-        """Embed traces (n, C, T) one by one; return float32 (n, 1, d), in the only space.
+        """Embed traces (n, C, T) one by one, in a single space; return float32 (n, 1, d).
 
-        Raises NotFittedError before `fit`, and the errors of `check_traces`.
+        Each trace is placed alone, so its point does not depend on the other traces. Raises
+        NotFittedError before `fit`, and the errors of `check_traces`.
         """
         check_is_fitted(self, "umap_")
         return np.array(
@@ -127,7 +128,7 @@ class UmapLearnReducer(Reducer):
 
 @contextmanager
 def shielded() -> Iterator[None]:
-    """Context manager that keeps umap-learn's warnings and thread count out of the process.
+    """Keep umap-learn's warnings and thread count out of the process, within a `with` block.
 
     Warnings of umap and of scikit-learn's manifolds are ignored within the block. At its end the
     number of threads of torch is set back to what it was, also after an exception: numba sets it

@@ -87,10 +87,10 @@ def _request_type(handler: Callable[..., Any], optional_fields: Json) -> type[St
 
     It has a field for each parameter of the handler (the method that answers the request), except a
     `**` parameter. A parameter with a default may be left out of a request, and has its default
-    then. The `optional_fields`, given as types by name, may be left out too, and are UNSET then.
-    Decoding refuses unknown fields. Underscores at the end of a parameter's name are left out in a
-    request: `id_` is `id` there. The type gets the handler's docstring, and as name the handler's,
-    with a capital, and `Request` behind it.
+    then. The `optional_fields`, given as types by name, may be left out too, and are msgspec's
+    UNSET then. Decoding refuses unknown fields. Underscores at the end of a parameter's name are
+    left out in a request: `id_` is `id` there. The type gets the handler's docstring; its name is
+    like `ReportRequest` for the handler `report`.
     """
     hints = get_type_hints(handler, include_extras=True)
     members: list[tuple[Any, ...]] = []
@@ -123,8 +123,8 @@ async def read_body(request: Request, struct_type: type[T]) -> T:
     The body must be an object without nested objects; the media type is not checked. Raises
     HTTPException: 400 for a body that is no JSON or has a name twice, 422 for a missing field, an
     unknown name (if `struct_type` forbids unknown fields), and a value that the type does not take.
-    Raises ClientDisconnect if the client goes away before the whole body has come, and
-    HTTPException 413 while it is read, if `Guard` finds it too large.
+    Raises ClientDisconnect if the client goes away before the whole body has come. While the body
+    is read, HTTPException 413 is raised if it is larger than the server's `Guard` allows (1 MiB).
     """
     body = await request.body()
     try:
@@ -147,9 +147,9 @@ async def read_body(request: Request, struct_type: type[T]) -> T:
 def read_query(request: Request, struct_type: type[T], **body: bytes) -> T:
     """Convert the query of a request and the parameters in its path to a struct of `struct_type`.
 
-    If the body is bytes, `body` has these bytes under the name of the field that gets them. Texts
-    are converted to the types of the fields, like "1" or "true" to True. Raises HTTPException 422
-    for an unknown name (if `struct_type` forbids unknown fields), a name that comes twice (also
+    Keyword arguments (`body`) are further fields by name; a body of raw bytes is given in this way.
+    Texts are converted to the types of the fields, like "1" or "true" to True. Raises HTTPException
+    422 for an unknown name (if `struct_type` forbids unknown fields), a name that comes twice (also
     once in the query and once in the path or in `body`), a missing field and a wrong value.
     """
     pairs = [*request.query_params.multi_items(), *request.path_params.items(), *body.items()]
@@ -168,8 +168,8 @@ def as_samples(value: Any, channels: int = 1) -> TraceArray:
     ----------
     value : bytes, list of float, or list of list of float
         Bytes are raw float32, little-endian, channel after channel. A nested list has a list for
-        each channel. None becomes NaN, and a number beyond float32 infinity; for the engine both
-        are faults of the trace.
+        each channel. None becomes NaN, and a number that is too large for float32 becomes infinity.
+        No error is raised for either; the engine that gets the trace sees the fault.
     channels : int
         Number of channels in bytes, 1 or more; it has no effect on lists.
 
@@ -218,9 +218,9 @@ def _look_like_float64(words: NDArray[np.float32]) -> bool:
 
     The low half of a float64 number, the words at even positions, is the end of its fraction:
     random bits, or zeros. So the result is True if all low halves are zero and some high half is
-    not, as for whole numbers. It is also True if many low halves, at least `LARGE_SHARE` of all
-    words, are beyond `LARGEST`, which no sample may be; words that are not finite do not count. It
-    is False for fewer than `MIN_WORDS` words and for an odd number.
+    not, as for whole numbers. It is also True if many low halves, at least 2.5 % of all words
+    (`LARGE_SHARE`), are larger than any sample may be, 1e18 (`LARGEST`); words that are not finite
+    do not count. It is False for fewer than 32 words (`MIN_WORDS`) and for an odd number.
     """
     if len(words) % 2 or len(words) < MIN_WORDS:
         return False
@@ -240,9 +240,10 @@ def _response_type(
     """Make and return a msgspec struct type named `name`, which describes a response.
 
     It has the fields of the dataclass `record`, if one is given, except those in `without`, with
-    their types in JSON (`_json_field_types`, which leaves fields out that are marked as "apart").
-    It also has the fields of `more`, given as types by name; they replace fields of the record with
-    the same name. No field has a default. Its docstring is `about`, followed by that of the record.
+    the types that they have in JSON; a field whose metadata has the key "apart" is left out, too
+    (`_json_field_types`). It also has the fields of `more`, given as types by name; they replace
+    fields of the record with the same name. No field has a default. Its docstring is `about`,
+    followed by that of the record.
     """
     members = _json_field_types(record) if record else {}
     types = {key: hint for key, hint in members.items() if key not in without}
@@ -423,11 +424,11 @@ def problem_response(
 ) -> Response:
     """Return the response to a request that is not served, in JSON with the fields of `Problem`.
 
-    These are the status, its title, the detail, the action "verify" and the type "about:blank". The
-    media type is application/problem+json. The detail is put on one line, and passwords of URLs in
-    it are masked. `headers` are added to the response; with status 503 it also has the header
-    Retry-After, with 1 second, unless they have it. Raises ValueError for a status that HTTP does
-    not know.
+    These are the status, its title, the detail, the type "about:blank", and the action "verify", by
+    which the robot has the part checked. The media type is application/problem+json. The detail is
+    put on one line, and passwords of URLs in it are masked. `headers` are added to the response;
+    with status 503 it also has the header Retry-After, with 1 second, unless they have it. Raises
+    ValueError for a status that HTTP does not know.
     """
     retry = {"Retry-After": str(RETRY_SECONDS)} if status == 503 else {}
     line = " ".join(without_password(detail).split())
@@ -444,9 +445,10 @@ def _error_response(request: Request, error: Any) -> Response:
 
     An HTTPException has a status, a text and headers of its own; but for the statuses 404 and 405,
     which only starlette raises, dengine has its own text. Another error gets the status of the
-    first type in `STATUSES` that it is an instance of, and its own text, in which Python's
-    arguments are written as options (`as_options`: `rate_hz=500` becomes `--rate-hz 500`). An
-    exception of no such type gets 500 with a general text, and is logged with its traceback.
+    first type in the table `STATUSES` that it is an instance of, and its own text, in which
+    Python's arguments are written as options of the command line (`as_options`: `rate_hz=500`
+    becomes `--rate-hz 500`). An exception of no such type gets 500 with a general text, and is
+    logged with its traceback.
     """
     if isinstance(error, HTTPException):
         detail = NO_ROUTE.get(error.status_code, error.detail)
@@ -539,13 +541,14 @@ class Operation:
         return json_response(result if is_json else response_fields(self.response, result))
 
     def describe(self, schemas: Json) -> Json:
-        """Return the operation as an OpenAPI operation object, a dict.
+        """Return the operation, a method on a path, as an OpenAPI operation object, a dict.
 
-        It has the summary (the handler's docstring), the responses (200, and for any other status a
-        problem, the JSON object that tells an error), and for a POST the request's body. The fields
-        are parameters of a GET, and of a POST whose body may be bytes, except the field that gets
-        these bytes; only fields in the path are marked as required. `schemas` has the JSON schema
-        of every request type and response by name.
+        It has the summary (the docstring of the handler that answers), the responses (200, and for
+        any other status a problem, the JSON object that tells an error), and for a POST the
+        request's body. The fields of the request are parameters of a GET, and also of a POST whose
+        body may be raw bytes, except the field that gets these bytes; only fields in the path are
+        marked as required. `schemas` has the JSON schema of every request type and response by
+        name; it is only read.
         """
         request_schema = schemas[self.request_type.__name__]
         if self.response in RESPONSES:
@@ -594,9 +597,9 @@ def _json_content(name: str, media: str = JSON) -> Json:
 def openapi_document(operations: Iterable[Operation], version: str) -> Json:
     """Return the OpenAPI 3.1 document of these operations, a dict that can be encoded as JSON.
 
-    `version` is the version of the interface. An operation is a method on a path; `operations` is
-    gone through twice, so an iterator will not do. Tokens, which authorize requests, are described
-    as optional.
+    An operation is a method on a path, with the function that answers it. `version` is the version
+    of the interface that the document states. `operations` is gone through twice, so pass a list,
+    not an iterator. Tokens, which authorize requests, are described as optional.
     """
     types = [*RESPONSES.values(), *(operation.request_type for operation in operations)]
     _, schemas = msgspec.json.schema_components(types, ref_template=REF)

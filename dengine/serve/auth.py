@@ -60,16 +60,18 @@ CURRENT_TOKEN = ContextVar("CURRENT_TOKEN", default=ANYBODY)  # of the request b
 def read_tokens(file: Path) -> tuple[Token, ...]:
     """Read tokens from a file that only its owner may use, in the order of its lines.
 
-    Each line is a secret, optionally followed by `viewer` or `operator` and the owner's name. A
-    secret alone is an operator's. Empty lines are skipped, and what is beyond 64 KiB is not read. A
-    file in the folder that the variable CREDENTIALS_DIRECTORY names (systemd sets it) may also be
-    readable by its group. On Windows no permission is checked.
+    A token authorizes requests. Each line is a secret, optionally followed by `viewer` (who may
+    only read) or `operator` (who may also change something), and then by the name of the token's
+    owner. A secret alone is an operator's, without a name. Empty lines are skipped, and what is
+    beyond 64 KiB is not read. A file in the folder that the variable CREDENTIALS_DIRECTORY names
+    (systemd sets it) may also be readable by its group. On Windows no permission is checked.
 
     Raises
     ------
     SettingError
         If the file cannot be read, others may use it, it has no token or one twice, a secret is
-        shorter than `MIN_TOKEN_LENGTH` or not printable ASCII, or a line is not of this form.
+        shorter than 16 characters (`MIN_TOKEN_LENGTH`) or not printable ASCII, or a line is not of
+        this form.
     """
     with (
         instead(SettingError, f"Cannot read the token file {file}", OSError),
@@ -148,13 +150,13 @@ def host_in_url(host: str) -> str:
 
 
 def names_this_machine(host: str) -> bool:
-    """Return whether a request's `Host` header is localhost or a loopback address, with or without
-    a port, in small or capital letters.
+    """Return whether a request's `Host` header is localhost or a loopback address.
 
-    It is False for "", for brackets without an address and for an IPv6 address without brackets;
-    what stands before an `@`, and behind a colon, `/`, `?` or `#`, is not checked. It is False as
-    well for a web page of another site whose name was made to resolve to this machine (DNS
-    rebinding): the browser sends that name as `Host`.
+    It may have a port, and be in small or capital letters. The result is False for "", for brackets
+    without an address and for an IPv6 address without brackets; what stands before an `@`, and
+    behind a colon, `/`, `?` or `#`, is not checked. It is False as well for a web page of another
+    site whose name was made to resolve to this machine (DNS rebinding): the browser sends that name
+    as `Host`.
     """
     try:
         return is_loopback(urlsplit(f"//{host}").hostname or "")
@@ -263,15 +265,17 @@ class Guard:
             await self.app(scope, _limit_body(receive), _with_headers(send))
 
     def _check(self, scope: Scope) -> None:
-        """Raise HTTPException for a request that is not allowed.
+        """Raise HTTPException for a request that is not allowed, and set the token of the request.
 
-        The checks are, in this order: a request to a server without tokens must call it localhost
-        or by a loopback address (421); `_check_token` checks the token (401, 403; /healthz needs
-        none), and sets the context variable `CURRENT_TOKEN` to it, or to `ANYBODY` on a server
-        without tokens; a request that may change something (not GET, HEAD or OPTIONS) must not come
-        from a web page of another host or port, by its headers Origin and Sec-Fetch-Site (403); and
-        the announced length of the body must be at most `MAX_BODY` (413), 1 MiB. A token in the
-        path (/RPC2/TOKEN) is removed from `scope`.
+        The checks are, in this order. A request to a server without tokens must call it localhost
+        or by a loopback address (421). The request must have a token of the server, unless it is
+        for /healthz (401), and a token that may only read does not allow a request that may change
+        something, one that is not GET, HEAD or OPTIONS (403); `_check_token` checks this, and sets
+        the context variable `CURRENT_TOKEN` to the token, or to `ANYBODY`, which allows everything,
+        on a server without tokens. A request that may change something must not come from a web
+        page of another host or port, by its headers Origin and Sec-Fetch-Site (403). The announced
+        length of the body must be at most 1 MiB, `MAX_BODY` (413). A token in the path
+        (/RPC2/TOKEN) is removed from `scope`.
         """
         headers = Headers(scope=scope)
         host = headers.get("host", "")
@@ -297,11 +301,11 @@ class Guard:
     def _check_token(self, scope: Scope, headers: Headers) -> None:
         """Check a request's token, and set the context variable `CURRENT_TOKEN` to it.
 
-        Raises HTTPException: 401 for a missing or wrong token, 403 for a viewer's token on a
-        request that may change something (a method other than GET, HEAD and OPTIONS). A request for
-        /healthz without a right token is allowed, and `CURRENT_TOKEN` is then not set. A server
-        without tokens allows every request, with the token `ANYBODY`. A secret in the path is
-        removed from `scope`, the ASGI scope of the request.
+        Raises HTTPException: 401 for a missing or wrong token, 403 for a viewer's token, which may
+        only read, on a request that may change something (a method other than GET, HEAD and
+        OPTIONS). A request for /healthz without a right token is allowed, and `CURRENT_TOKEN` is
+        then not set. A server without tokens allows every request, with the token `ANYBODY`. A
+        secret in the path is removed from `scope`, the ASGI scope of the request.
         """
         secret = take_token(scope, headers.get("authorization", ""))
         token = find_token(self.tokens, secret) if self.tokens else ANYBODY
@@ -340,8 +344,9 @@ def _limit_body(receive: Receive) -> Receive:
 
 
 def _with_headers(send: Send) -> Send:
-    """Return an ASGI `send` that adds the security headers in `HEADERS` to every response, after
-    the response's own.
+    """Return an ASGI `send` that adds the security headers in `HEADERS` to every response.
+
+    They come after the response's own headers. All messages are passed on to the given `send`.
     """
 
     async def send_with_headers(message: Message) -> None:

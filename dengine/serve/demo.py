@@ -25,15 +25,17 @@ POLICY = {"alpha": 0.1, "lower_bound": 0.9, "audit_rate": 0.05}
 
 @asynccontextmanager
 async def playing(service: CellService, data: Any, seed: int) -> AsyncIterator[None]:
-    """Play recordings through the service in a random order, in a task beside the context's block.
+    """Play recordings through the service in random order, in a task beside the `async with` block.
 
-    The task plays each recording once, and is cancelled when the context ends. It reports the
-    results of verified parts and of line stops, and waits for retrains during the first `N_FAST`
-    parts. Its errors are logged (see `drive`).
+    The task plays each recording once, in place of a robot: it asks for a decision on each part,
+    and reports the recorded result of parts that are to be checked (VERIFY), and of accepted bad
+    parts, which stop the line. During the first 150 parts (`N_FAST`) it waits for retrains that are
+    under way. It is cancelled when the block ends. Its errors are logged (see `drive`).
 
     Parameters
     ----------
     service : CellService
+        It decides, and gets the results.
     data : object
         Anything that `load_dataset` takes.
     seed : int
@@ -57,13 +59,14 @@ async def playing(service: CellService, data: Any, seed: int) -> AsyncIterator[N
 async def drive(service: CellService, cell: ReplayCell) -> None:
     """Insert every part of a data set once, ask for a decision, and report the outcome.
 
-    `cell` plays them, in the order of `cell.order`, from its first part on; parts have the numbers
-    "0001", "0002" and so on. The recorded result is reported for verified parts, and for accepted
-    parts that are bad, which stop the line. The first `N_FAST` parts (150) come without a pause,
-    but a retrain that is under way is waited for; later parts come once a second, and their report
-    after 40 % of this time. An accepted good part and a rejected part get no report. A log line
-    says when all parts were played. An exception, also that of a full queue, is logged and ends the
-    demonstration, not the server; nothing is raised, except if the task is cancelled.
+    `cell` plays the recorded parts, in the order of `cell.order`, from its first part on; parts
+    have the numbers "0001", "0002" and so on. The recorded result is reported for parts that are to
+    be checked (VERIFY), and for accepted parts that are bad, which stop the line. The first 150
+    parts (`N_FAST`) come without a pause, but a retrain that is under way is waited for; later
+    parts come once a second, and their report after 40 % of this time. An accepted good part and a
+    rejected part get no report. A log line says when all parts were played. An exception, also the
+    one of a service whose queue is full, is logged and ends the demonstration, not the server;
+    nothing is raised, except if the task is cancelled.
     """
     loop = asyncio.get_running_loop()
     next_start = loop.time()

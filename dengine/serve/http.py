@@ -100,8 +100,10 @@ class HttpApi:
 
     @cached_property
     def operations(self) -> list[Operation]:
-        """The `Operation` of every path and method of the interface: its handler, and the type of
-        its response; cached. XML-RPC and the web page are not among them (see `create_app`).
+        """List the `Operation` of every path and method of the HTTP interface; cached.
+
+        An `Operation` has the path, the method, the handler that answers, and the type of its
+        response. XML-RPC and the web page are not among them (see `create_app`).
         """
         # A guarantee may name a class, and no request over the network may cause an import.
         policy = field_types(Policy, "guarantee") | {"force_limits": list[str]}
@@ -190,12 +192,13 @@ class HttpApi:
     async def _find_id(self, id_: str, part: str) -> str:
         """Return the id of a decision, given by its id or by its part's number.
 
-        Raises HTTPException 422 for both or neither, UnknownDecisionError for a part without a
-        decision, and ReportConflictError for a part with several (rejects count only if there is
-        nothing else). Only the newest 20 decisions on the part are looked at. A decision's id in
-        place of the part's number is found, too, if no part has this number. For a part it
-        waits in the queue, and raises BusyError if that is full or the service is closing, and
-        StoreError if the store cannot be read. An id is neither looked up nor checked.
+        An id is returned as it is, neither looked up nor checked. For a part the newest 20
+        decisions on it are looked at: the result is the only decision that is no REJECT or, if
+        there are only rejects, the only REJECT. If no part has this number, but a decision has it
+        as its id, this is the result. Raises HTTPException 422 for both or neither of id and part,
+        UnknownDecisionError for a part without a decision, and ReportConflictError if several
+        decisions count. For a part it waits in the queue of requests, and raises BusyError if that
+        is full or the service is closing, and StoreError if the store cannot be read.
         """
         if bool(id_) == bool(part):
             raise HTTPException(
@@ -210,16 +213,17 @@ class HttpApi:
         part: PartNumber = "",
         author: Author = "",
     ) -> Changed:
-        """Correct a label, from the next decision on, record that as an event, and return what
-        changed.
+        """Correct a wrong label, from the next decision on, and return what changed.
 
-        The label as it was reported stays on record. A forgotten label counts again. If the part
-        already counts with this label, nothing changes, but a training under way begins again. Only
-        the newest 20 decisions on a part are looked at. 404: an unknown id or part; 409: a part
-        with several decisions that are no rejects, or with nothing but several rejects; 422: a
-        decision without a label, both or neither of id and part, no author of 1 to 200 printable
-        characters (unless the token has a name), or an author that is not the token's; 503: the
-        queue is full, the store does not answer, or the decision's trace is damaged.
+        The decision is named by its id or by its part's number. The change is recorded as an event
+        in the log, with its author; the label as it was reported stays on record. A label that
+        /forget withdrew counts again. If the part already counts with this label, nothing changes,
+        but a training under way begins again. Of a part the newest 20 decisions are looked at, and
+        rejects count only if there is nothing else; if several decisions count, the response is
+        409. 404: an unknown id or part. 422: a decision without a label, both or neither of id and
+        part, no author of 1 to 200 printable characters (unless the token has a name), or an author
+        that is not the token's. 503: the queue of requests is full, the store does not answer, or
+        the decision's stored trace is damaged.
         """
         decision_id = await self._find_id(id_, part)
         return await self._change(
@@ -232,20 +236,22 @@ class HttpApi:
         author: Author = "",
         reason: Annotated[str, Meta(description="For the event log.")] = "",
     ) -> Changed:
-        """Leave the labels of the decisions `ids` out of training and of all counts, record that as
-        an event with the reason, and return what changed.
+        """Leave the labels of decisions out of training and all counts; return what changed.
 
-        /correct makes a forgotten label count again. If the id of one decision is unknown (404), a
-        decision has no label, or no id is given (422), no label is forgotten. 422 also for a
-        request without an author, unless the token has a name, and for an author that is not the
-        token's, is longer than 200 characters or not printable. The certificate, which bounds the
-        errors of the decisions, counts a forgotten outcome as wrong if the part was accepted, or
-        was checked though the model was certain. In the reason each run of white space becomes a
-        space. If a rollback pinned the version in force, and this was trained with one of the
-        labels, or one is older than all that it was trained with, it is released, so that retrains
-        may replace it. A training under way begins again, even if the labels are forgotten already;
-        no event is recorded then. 503: the queue is full, the store does not answer, or the trace
-        of a decision is damaged.
+        `ids` are those of the decisions. The change is recorded as an event in the log, with its
+        author and the reason, in which each run of white space becomes a space. /correct makes a
+        forgotten label count again. If the id of one decision is unknown (404), a decision has no
+        label, or no id is given (422), no label is forgotten. 422 also for a request without an
+        author, unless the token has a name, and for an author that is not the token's, is longer
+        than 200 characters or not printable.
+
+        The certificate, which bounds the share of wrong decisions, counts a forgotten outcome as
+        wrong if the part was accepted, or was checked at random though the model was certain. If a
+        rollback pinned the version that decides now, so that no automatic retrain replaces it, this
+        is undone if the version was trained with one of the labels, or if one of them is older than
+        all labels of its training. A training under way begins again, even if the labels are
+        forgotten already; no event is recorded then. 503: the queue of requests is full, the store
+        does not answer, or the stored trace of a decision is damaged.
         """
         line = " ".join(reason.split())
         return await self._change(
@@ -290,12 +296,13 @@ class HttpApi:
     async def retrain(self, author: Author = "") -> Changed:
         """Begin a retrain, record who asked for it as an event, and do not wait for its end.
 
-        A pinned version is released, so that the new version may replace it. If a retrain is under
-        way already, or was asked for and cannot begin yet, the response says so, and nothing
-        changes. If no other process can train, the response comes after the retrain. /versions
-        tells afterwards whether the new version was put in force or dropped. 422: no author of 1 to
-        200 printable characters (unless the token has a name), or an author that is not the
-        token's. 503: the queue is full, or the store does not answer.
+        The version of the model that a rollback pinned, so that no automatic retrain replaces it,
+        is released: the new version may replace it. If a retrain is under way already, or was asked
+        for and cannot begin yet, the response says so, and nothing changes. If no other process can
+        train, the response comes after the retrain. /versions tells afterwards whether the new
+        version decides now or was dropped. 422: no author of 1 to 200 printable characters (unless
+        the token has a name), or an author that is not the token's. 503: the queue of requests is
+        full, or the store does not answer.
         """
 
         def begin(engine: DataEngine, by: str) -> Changed:
@@ -322,12 +329,14 @@ class HttpApi:
             bool, Meta(description="Include the state of the safe mode's detectors.")
         ] = False,
     ) -> Json:
-        """Return how the robot cell is doing: counts of decisions, version, faults, queue and
-        alarm.
+        """Return how the robot cell is doing: counts, version, faults, queue of requests and alarm.
 
-        The counts are of all decisions, and of the newest 500; the alarm is the most urgent thing
-        that somebody should look at, empty if there is none. 422: the stored recipe cannot be read;
-        503: the queue is full, the server is closing, or the store cannot be read.
+        The counts are of all decisions, and of the newest 500. The version is that of the model
+        that decides now. The alarm is the most urgent thing that somebody should look at, empty if
+        there is none. `claim` says in a sentence what share of the accepted parts was bad at most.
+        With `watch` the response also has the state of the detectors whose alarm begins a safe
+        mode, in which every part is checked. 422: the stored recipe, the settings of the engine,
+        cannot be read; 503: the queue is full, the server is closing, or the store cannot be read.
         """
         status = await self.service.status(watch)
         line = {name: getattr(self.service, name) for name in api.LINE}
@@ -352,15 +361,16 @@ class HttpApi:
         ] = "",
         **where: Any,
     ) -> Json:
-        """Return up to `limit` decisions, newest first, and in `older` the id that `before` takes
-        for the next page, null if none are left. An unknown `before` is 404.
+        """Return up to `limit` decisions, newest first, as one page.
 
-        Only decisions with the given label, action, reason, predicted (what the model alone would
-        have done) and part (the part's number) are returned, if these are given, and only those
-        between the times since (included) and until (not included), in seconds since 1970. With
-        open, label and action are ignored. 422: a value that a field cannot have, or an invalid
-        `before`; 503: the queue is full, the store cannot be read, or the trace of the decision
-        `before` is damaged.
+        `older` in the response is the id that `before` takes for the next page, null if none are
+        left. Only decisions with the given label, action, reason, predicted (what the model alone
+        would have done) and part (the part's number) are returned, if these are given, and only
+        those between the times since (included) and until (not included), in seconds since 1970.
+        With open, only decisions to check a part whose result was not reported are returned, and
+        label and action are ignored. 404: an unknown `before`; 422: a value that a field cannot
+        have, or an invalid `before`; 503: the queue of requests is full, the store cannot be read,
+        or the stored trace of the decision `before` is damaged.
         """
         selection = HistoryFilter(**where)
         if open_:
@@ -433,12 +443,12 @@ class HttpApi:
         return response_fields("Events", events=events[::-1])
 
     async def changes(self) -> Response:
-        """Return a stream of server-sent events, which ends when the server ends.
+        """Return a stream of server-sent events, by which a client hears of changes.
 
-        The first is hello, with the server's version, and the second always changed. Then comes
-        changed whenever decisions, reports of outcomes, changes by hand (also refused ones) or
-        retrains have come since the last event, and tick after each 5 seconds without any. Nothing
-        says what has changed.
+        The stream ends when the server ends. The first event is `hello`, with the server's version,
+        and the second always `changed`. Then comes `changed` whenever decisions, reports of
+        outcomes, changes by hand (also refused ones) or retrains have come since the last event,
+        and `tick` after each 5 seconds without any. Nothing says what has changed.
         """
 
         async def event_stream() -> AsyncIterator[str]:
@@ -466,9 +476,9 @@ class HttpApi:
 
         Degraded: the store, or the journal (the file that takes its records first), cannot be
         written or does not answer in time, the store differs from its ledger (a hash chain of its
-        rows), or the last three or more retrains were dropped. Down: the engine's thread has ended,
-        or was busy with one thing for a minute. The texts of the faults, and the number of requests
-        in the queue, come with it.
+        rows), or the last three or more retrains were dropped (their models do not decide). Down:
+        the engine's thread has ended, or was busy with one thing for a minute. The response also
+        has the texts of the faults, and the number of requests in the queue.
         """
         running = self.service.engine.state
         is_alive = self.service.silent_seconds < MAX_SILENT
@@ -490,9 +500,9 @@ class HttpApi:
     async def _find(self, id_: str) -> StoredDecision:
         """Return the stored decision with this id, with its trace and label.
 
-        Raises UnknownDecisionError for an unknown id, ReportError for an invalid one, StoreError if
-        it cannot be looked up or its trace is damaged, and BusyError if the queue is full or the
-        service is closing.
+        The request waits in the queue for the engine. Raises UnknownDecisionError for an unknown
+        id, ReportError for an invalid one, StoreError if it cannot be looked up or its trace is
+        damaged, and BusyError if the queue is full or the service is closing.
         """
         stored = await self.service.find(id_)
         if stored is None:
@@ -511,12 +521,12 @@ class HttpApi:
 
 
 def _checked_author(author: str) -> str:
-    """Return the author for the event log: the name of the token that the present request has
-    (`CURRENT_TOKEN`), or the given name if this token has none.
+    """Return the author of a change for the event log: the token's name, or else the given name.
 
-    In the given name each run of white space becomes a single space. Raises HTTPException 422 if
-    there is no name, if the name is longer than 200 characters or not printable, and if both names
-    are given and differ.
+    The token is that of the present request (`CURRENT_TOKEN`); its name is empty if it is a
+    program's. In the given name each run of white space becomes a single space. Raises
+    HTTPException 422 if there is no name, if the name is longer than 200 characters or not
+    printable, and if both names are given and differ.
     """
     owner = CURRENT_TOKEN.get().name
     name = " ".join(author.split())
@@ -532,13 +542,14 @@ def _checked_author(author: str) -> str:
 def _read_explanation(store: SqlStore, id_: str) -> Json:
     """Return the explanation of a decision, named by its id or its part's number, as a JSON dict.
 
-    Beside the `Explanation` it has the decision's trace, the corrections of its label, the envelope
-    (low, median, high; None without one), and the newest `N_BADS` (10) traces of bad parts among
-    the newest `N_LABELS` (200) labels of robot cell and product, oldest first (none if their shape
-    is not that of the decision's trace). Raises what `explain` raises, such as StoreError for a
-    damaged trace of the decision or of a neighbour, and StoreError if one of these labels is
-    neither 0 nor 1 or their traces differ in shape. Other damaged traces are left out, and an event
-    says so.
+    Beside the fields of the `Explanation` it has the decision's trace, the corrections of its
+    label, the band of the traces of good parts (low, median, high; None without one), and up to 10
+    (`N_BADS`) traces of bad parts. These are the newest among the newest 200 (`N_LABELS`) labels of
+    this robot cell, and of the cells that make the same product, oldest first; none if their shape
+    is not that of the decision's trace. Raises what `explain` raises, such as UnknownDecisionError,
+    and StoreError for a damaged trace of the decision or of one of its nearest neighbours. Raises
+    StoreError also if one of the 200 labels is neither 0 nor 1, or their traces differ in shape.
+    Other damaged traces are left out, and an event in the store says so.
     """
     explanation = explain(store, id_)
     trace = explanation.trace
@@ -567,19 +578,22 @@ def create_app(
     """Create the Starlette application that serves a robot cell.
 
     It serves the operations of `HttpApi`, XML-RPC at POST /RPC2 (`RobotCalls`), and the web page.
-    Every request first passes `Guard`. Errors become `Problem`s, and those of an XML-RPC call
-    become faults. The service gets an observer, which counts its responses for `GET /metrics`. The
-    caller closes the service after the application has ended.
+    Every request first passes `Guard`, which refuses those that are not allowed. Errors are
+    answered as JSON (`Problem`), and those of an XML-RPC call as XML-RPC faults. The service gets
+    an observer, which counts its responses for `GET /metrics`. The caller closes the service after
+    the application has ended.
 
     Parameters
     ----------
     service : CellService
+        The engine with its queue of requests.
     tokens : tuple of Token, optional
         Empty: no request needs a token, and `Guard` refuses requests whose host is neither
         localhost nor a loopback address. Serve the application at a loopback address alone then;
         this is not checked here.
     recorder : RtdeRecorder, optional
-        Records the traces for `decide_recorded`; the caller closes it. None: that call is a fault.
+        Records the traces for the XML-RPC call `decide_recorded`; the caller closes it. None: the
+        answer to that call is a fault.
 
     Returns
     -------

@@ -15,7 +15,7 @@ import numpy as np
 
 from ...errors import DataError, listed
 from ..checks import check_forms
-from ..dataset import Fault
+from ..dataset import Fault, expect_data
 from ..description import UNKNOWN, Clock, Description, Stated, flat
 from ..read.files import as_source, caught, match_files, natural_key, read_file
 from ..read.frames import read_frame
@@ -42,6 +42,8 @@ SUFFIXES = dict.fromkeys(TEXTS, "text") | {
     ".mcap": "mcap",
     ".db3": "mcap",
 }
+# Formats of recordings that other packages read.
+FOREIGN = (".npy", ".mat", ".h5", ".hdf5", ".tdms", ".bag", ".xlsx", ".xls", ".feather", ".pkl")
 # Hidden files, pages for people, and descriptions.
 NO_RECORDING = re.compile(
     r"(?i)(^|/)(\.|(readme|licen[sc]e|notes|changelog)(\.[^/]*)?$|recordings\.toml$)"
@@ -57,22 +59,26 @@ Names = Sequence[str]
 def describe(source: Any, stated: Stated | None = None) -> Description:
     """Propose a description of recordings, by looking at some of them.
 
+    Recordings are files or tables with the samples of parts; a description says how they are read:
+    which files and columns have the samples, times, part numbers and labels.
+
     Parameters
     ----------
     source : path or DataFrame
         A folder, a file or a table of recordings.
     stated : mapping, optional
         Keys whose values are known, like `{"label.column": "verdict"}`, or sections with such keys.
-        They are kept, but a key with the value `?` counts as not stated, `ignored` is proposed
-        anew, and `[rows]` may get further columns and words. The proposals for the other keys
-        follow from them.
+        They are kept, but a key with the value `?` counts as not stated, `ignored` (the columns
+        without a use) is proposed anew, and `[rows]`, which says by the words in a column which
+        rows are samples, may get further columns and words. The proposals for the other keys follow
+        from them.
 
     Returns
     -------
     Description
-        A key has the value `?` if no rule proves a value. `open_keys` lists these keys, and
-        `notes` has the evidence and the possible values by key. While `files`, `layout` or
-        `part.column` is `?`, the keys that depend on it are not proposed.
+        A key has the value `?` if no rule proves a value. `open_keys` lists these keys, and `notes`
+        has the evidence and the possible values by key. While `files`, `layout` (how files hold
+        parts) or `part.column` is `?`, the keys that depend on it are not proposed.
 
     Raises
     ------
@@ -80,9 +86,9 @@ def describe(source: Any, stated: Stated | None = None) -> Description:
         If there is no file, or none that can be read and holds samples, or if the package that
         reads such files is not installed. Also if a stated value is wrong: an unknown key or a
         value of the wrong type, a column of times, a channel or, in the layout `long`, a
-        `part.column` that does not exist (a bag's are not checked), a source of labels that has no
-        words, a malformed pattern of files, or settings in `[text]` or `[time]` that no file can be
-        read with.
+        `part.column` that does not exist (those of a ROS bag are not checked), a place of the
+        labels at which no recording has one, a malformed pattern of files, or settings in `[text]`
+        or `[time]` that no file can be read with.
     SettingError
         If a stated `windows.trigger`, which cuts long recordings, is malformed.
     ValueError
@@ -107,14 +113,16 @@ def describe(source: Any, stated: Stated | None = None) -> Description:
 def choose_files(p: Proposal, root: Path) -> bool:
     """Set in `p` which files are the recordings, and their format; return whether that is clear.
 
-    If `root` is a file, it is the only one. In a folder they are the files that match the stated
-    `files`. If none are stated, they are the files with the only likely ending (`likely_endings`);
-    if several endings are likely, `files` is set to `?` with a note that lists them, a note on
+    `p` is the description so far; keys that the user stated stay. If `root` is a file, it is the
+    only one. In a folder they are the files that match the stated patterns `files`. If none are
+    stated, they are the files with the only likely ending (`likely_endings`). If several endings
+    are likely, `files` is set to `?` (the user must answer) with a note that lists them, a note on
     `channels` says that the channels follow from `files`, and the result is False. If it is True,
-    `p.base` is the folder, `p.names` has these files and `p.others` the other files that `names_in`
-    finds without patterns. `files` becomes `globs` of the names, and `format` that of the first
-    file's suffix, `text` for an unknown one; stated keys stay. `exclude` is not looked at. Raises
-    DataError if there is no file of recordings or a stated pattern is malformed.
+    `p.base` is the folder, `p.names` has these files, and `p.others` the other files that may be
+    recordings by their name (`names_in` without patterns). `files` becomes patterns that match
+    `p.names`, like `*.csv`, and `format` that of the first file's suffix, `text` for an unknown
+    one. `exclude`, the patterns of files that are no recordings, is not looked at. Raises DataError
+    if there is no file of recordings or a stated pattern is malformed.
     """
     stated = p.description.files
     every = names_in(root, ())
@@ -122,6 +130,12 @@ def choose_files(p: Proposal, root: Path) -> bool:
     if not names:
         raise DataError(f"Expected files of recordings, {listed(SUFFIXES)}, in {root}, got none.")
     endings = likely_endings(names)
+    expect_data(
+        stated or not {*endings} <= {*FOREIGN},
+        f"files that dengine reads in {root}",
+        endings,
+        "see the page 'Recordings that dengine does not read'",
+    )
     if len(endings) > 1 and not stated:
         p.put("files", UNKNOWN, f"one of {listed(f'**/*{ending}' for ending in endings)}")
         p.notes["channels"] = "they follow from files"
@@ -137,12 +151,14 @@ def choose_files(p: Proposal, root: Path) -> bool:
 def likely_endings(names: Names) -> Names:
     """Return the endings of file names of which one may tell the recordings from other files.
 
-    They are the suffixes that several files have, and `.mcap` if one file has it; or else all. If
-    there is only one, the endings that tell signals apart come before it: `Kraft.csv` of
-    `1_Kraft.csv`, the last word with its suffix, behind the part. There must be two parts and two
-    such endings or more, and each part must have a file with each ending. If any ending is a word
-    like `ok` or `pending`, none counts. If any has a digit, they count only if there are 2 to 4
-    endings and 10 parts or more: numbered pieces of a part's curve.
+    They are the suffixes that several files have, and `.mcap` even if only one file has it; if
+    there are none of these, all suffixes. If there is only one, and the files are one for each part
+    and signal, like `1_Kraft.csv` and `1_Weg.csv`, the endings of the signals, `Kraft.csv` and
+    `Weg.csv`, come before it. Such an ending is what stands behind the last `-`, `_` or blank of a
+    name, and the part is what stands before. There must be at least two parts and two such endings,
+    and each part must have a file with each ending. If any ending is a word like `ok` or `pending`,
+    none counts. If any has a digit, they count only if there are 2 to 4 endings and 10 parts or
+    more: they are then numbered pieces of a part's curve.
     """
     counts = Counter(map(suffix_of, names))
     likely = [suffix for suffix, n in counts.items() if n > 1 or suffix == BAG] or [*counts]
@@ -169,8 +185,8 @@ def names_in(root: Path, patterns: Names) -> Names:
     """Return the files of a folder that may be recordings: relative paths, run_2 before run_10.
 
     Hidden files, files in hidden folders or outside of the folder (`../x.csv`), `recordings.toml`,
-    and files like README or LICENSE are left out. Without `patterns`, files with an unknown suffix
-    are left out too. If `root` is a file, the list has only its name.
+    and files like README or LICENSE are left out. Without `patterns`, only files with a suffix of
+    recordings, like .csv or .json, are returned. If `root` is a file, the list has only its name.
     If nothing is there, the list is empty. Raises DataError for a malformed pattern, unless `root`
     is a file.
 
@@ -180,7 +196,9 @@ def names_in(root: Path, patterns: Names) -> Names:
         return [root.name]
     names = match_files(root, patterns or ["**/*"])
     names -= {*filter(NO_RECORDING.search, names)}
-    return sorted((n for n in names if patterns or suffix_of(n) in SUFFIXES), key=natural_key)
+    return sorted(
+        (n for n in names if patterns or suffix_of(n) in (*SUFFIXES, *FOREIGN)), key=natural_key
+    )
 
 
 def globs(names: Names) -> list[str]:
@@ -197,14 +215,16 @@ def globs(names: Names) -> list[str]:
 def read_tables(p: Proposal) -> list[Table]:
     """Return the tables of some of the files `p.names`, at least one, with the same column names.
 
-    At most 60 files are read, spread evenly over all, and no further file once 2 MB were read. Of
-    text files only those count whose form is the most frequent: the keys of `[text]` are set in `p`
-    first. Text files of another form move from `p.names` to `p.others`, and `exclude` may be set
-    to `?` (`propose_form`). Tables with other column names than the most frequent ones, of equally
-    frequent ones those of the largest table, are left out (Parquet files of such tables move to
-    `p.others`), and so are damaged files. `p.is_cut` is set if only the beginning of a file is
-    used. Raises DataError if no file can be read, also because the package that reads such files is
-    missing.
+    `p` is the description so far, and `p.names` are the files of recordings. At most 60 of them are
+    read, spread evenly over all, and no further file once 2 MB were read. Of text files only those
+    count whose form (delimiter, number of columns, header) is the most frequent: the keys of
+    `[text]`, which state this form, are set in `p` first. Text files of another form move from
+    `p.names` to `p.others`, and `exclude` may be set to `?`: the user must say whether they are
+    recordings (`propose_form`). Tables with other column names than the most frequent ones, of
+    equally frequent ones those of the largest table, are left out (Parquet files of such tables
+    move to `p.others`), and so are damaged files. `p.is_cut` is set if only the beginning of a file
+    is used. Raises DataError if no file can be read, also because the package that reads such files
+    is missing.
     """
     contents = dict[str, bytes]()
     faults = list[Fault]()
@@ -229,11 +249,13 @@ def read_tables(p: Proposal) -> list[Table]:
 def table_in(p: Proposal, content: bytes, name: str) -> Table:
     """Return the table of a file with this content; a text file gives all cells as texts.
 
-    An .npz file is read as one that holds all parts if it is the only file, or the layout `npz` is
-    stated; but not if another layout is. Of a text or jsonl file of more than 2 MB only the whole
-    lines of the first 2 MB are read (the whole file if no line ends there), and `p.is_cut` is set.
-    Raises DataError if the file is damaged, or if a line of a text file has a wrong number of
-    cells; but such lines of the only file are left out, unless all its lines are wrong.
+    `p` has the description so far, with the format of the files and how texts are written; `name`
+    is the file's name in errors. An .npz file is read as one that holds all parts if the user
+    stated the layout `npz`, `wide` or `long`, or no layout and it is the only file; otherwise as
+    one part. Of a text or jsonl file of more than 2 MB only the whole lines of the first 2 MB are
+    read (the whole file if no line ends there), and `p.is_cut` is set. Raises DataError if the file
+    is damaged, or if a line of a text file has a wrong number of cells; but such lines of the only
+    file are left out, unless all its lines are wrong.
     """
     about = p.description
     if about.format in ("text", "jsonl") and len(content) > MOST_BYTES:
@@ -253,15 +275,17 @@ def table_in(p: Proposal, content: bytes, name: str) -> Table:
 def propose_tables(p: Proposal, files: Tables) -> None:
     """Find the layout, then what each column is for, and set the keys that say so in `p`.
 
-    A stated layout stays; if it is `long`, `part.column` is looked for all the same. `files` has
-    the table of each file that is looked at. At most the first 50,000 rows of each are used;
-    `p.is_cut` is set if a file has more. `p.tables` becomes the tables of the first 240 parts
-    without damage, with only the rows that are samples, `p.columns` their columns, and `p.names` is
-    emptied unless each file is one part. If the layout or `part.column` is `?`, nothing more is
+    `p` is the description so far. The layout says how files hold parts, like `long` for parts one
+    below the other, which `part.column` tells apart. A stated layout stays; if it is `long`,
+    `part.column` is looked for all the same, unless it is stated. `files` has the table of each
+    file that is looked at. At most the first 50,000 rows of each are used; `p.is_cut` is set if a
+    file has more. `p.tables` becomes the tables of the first 240 parts without damage, with only
+    the rows that are samples, `p.columns` their columns, and `p.names` is emptied unless each file
+    is one part. If the layout or `part.column` is `?` (the user must answer), nothing more is
     proposed: `p.tables` and `p.names` stay, and a note on `channels` says why. Raises DataError if
-    there is no part without damage, if the tables do not split as a stated layout says, or if a
-    stated column, setting in `[time]` or source of labels is wrong, and SettingError for a
-    malformed `windows.trigger`.
+    there is no part without damage, if the tables do not split as a stated layout says, if a stated
+    column or setting in `[time]` is wrong, or if no recording has a label at the stated place, and
+    SettingError for a malformed `windows.trigger`, the condition at which long recordings are cut.
     """
     p.is_cut |= any(len(table.lines) > MOST_ROWS for table in files)
     files = [table.take(slice(MOST_ROWS)) for table in files]

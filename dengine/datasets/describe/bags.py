@@ -24,21 +24,26 @@ LISTING = "windows={listing=FILE, key=COLUMN, start=COLUMN, end=COLUMN}"
 def propose_bag(p: Proposal) -> None:
     """Set in `p` the channels, the clock and the source of labels of a ROS 2 bag.
 
-    Only the first 50,000 messages of the first file are looked at. Keys that the user stated stay.
-    `propose_channels` chooses a channel, or none, among the numbers in the first message of each
-    topic without a field `data`; the other numbers become `ignored`. Whether stated channels are in
-    the bag is not checked.
+    `p` is the description so far. Only the first 50,000 messages of the first file are looked at.
+    Keys that the user stated stay, except `ignored`. `propose_channels` chooses a channel (a signal
+    of the traces), or none, among the numbers in the first message of each topic without a field
+    `data`; the other numbers become `ignored`. Whether stated channels are in the bag is not
+    checked.
 
-    The clock is the time in the messages' headers if the first message of each of these topics has
-    it, else the time of the log, both in ns; a time in a header below 1 s counts as none. The rate,
-    `order` and `time.gap` follow from the times of the log in any case (`propose_rate`), those of
-    the first channel's topic, or of the first number's if there is no channel.
+    The clock, the times of the samples, is the time in the messages' headers if the first message
+    of each of these topics has it, else the time at which the bag's recorder got them, both in ns;
+    a time in a header below 1 s counts as none. The rate, `order` (of the parts) and `time.gap`
+    (the longest step allowed) follow from the recorder's times in any case (`propose_rate`), those
+    of the first channel's topic, or of the first number's if there is no channel.
 
-    `traces.samples` becomes `?`, and so do `windows.trigger`, unless `windows.listing` is stated,
-    and `label.topic`, unless anything of the label is stated. The notes on the last two list the
-    topics with a field `data`, and their words. If anything of the label is stated, `with_meanings`
-    sorts the words of its topic into good, bad and unchecked. A list of good or bad words that is
-    not stated and gets no word becomes `?`; a label that is in no topic gives no words.
+    `traces.samples`, the length of a trace, becomes `?` (the user must answer). So does
+    `windows.trigger`, the condition at which a part begins, unless `windows.listing`, a file with
+    the parts' starts and ends, is stated. So does `label.topic`, the topic whose messages are
+    labels, unless anything in `[label]` is stated. The notes on these two list the topics with a
+    field `data`, and their words (values of `data`). If anything in `[label]` is stated, the words
+    of its topic are sorted into good, bad and unchecked (`with_meanings`). A list of good or bad
+    words that is not stated and gets no word becomes `?`; a label that is in no topic gives no
+    words.
 
     Raises DataError if the file is no bag or is damaged before its first message, if the package
     that reads bags is missing, or if a setting in `[time]` is wrong; a later damage only ends the
@@ -79,7 +84,7 @@ def propose_bag(p: Proposal) -> None:
 
 
 def _fields(message: Any, path: str) -> Iterator[tuple[str, str]]:
-    """Yield (name, unit) for each number in a message, also in nested fields.
+    """Yield (name, unit) for each number in a message of a ROS bag, also in nested fields.
 
     `path` is the topic; the name is the topic and the fields, joined by dots. The unit is N or Nm
     if the number stands directly in a field named `force` or `torque`, else "". True and False are

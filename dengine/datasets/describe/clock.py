@@ -60,14 +60,17 @@ ANSWERS = (  # to a clock that the reader would refuse
 def propose_clock(p: Proposal) -> None:
     """Find the column of times and its form, and set `time.column` and `time.format` in `p`.
 
-    `time.column` is set to `?`, with a note, if several columns may tell the time (`is_clock`), or
-    one may and others a part of it, like a date or whole seconds that are the same in all rows of a
-    recording; these are not looked for beside a clock whose cells tell the day. It is `?`, too, if
-    no column may, but the columns have no names, or one is named `s`, which may be seconds or the
-    tool's position, one may count the samples (`is_counter`), or one is named like a clock and has
-    numbers that change. Otherwise, if no column may, it stays empty. Stated columns are kept; only
-    their forms are found. Of a column that is set `time.format` may be `?` (`form_of`). Raises
-    SettingError for a malformed `windows.trigger`.
+    `p` is the description so far; only columns without a use in it are looked at. `time.column`
+    becomes the only column that may tell the time (`is_clock`). It is set to `?` (the user must
+    answer), with a note, if several columns may, or if one may and others a part of it, like a date
+    or whole seconds that are the same in all rows of a recording; these are not looked for beside a
+    clock whose cells tell the day. If no column may tell the time, `time.column` is `?` if the
+    columns have no names, if one is named `s`, which may be seconds or the tool's position, if one
+    may count the samples (`is_counter`), or if one is named like a clock and has numbers that
+    change; otherwise it stays empty. Stated columns are kept; only their forms are found. Of a
+    column that is set, `time.format`, its unit or a pattern like `%H:%M:%S`, may be `?`
+    (`form_of`). Raises SettingError for a malformed `windows.trigger`, the condition at which long
+    recordings are cut.
     """
     clocks = [*filter(is_clock, p.unused)]
     if is_stated := "time.column" in p.stated:
@@ -117,9 +120,9 @@ def is_counter(column: Column) -> bool:
     A mere numbering of the rows does not. The steps from row to row (`Column.steps`) decide. For a
     column that is named like a counter (`index`, `sample`, `n`, ...) the result is True if any step
     differs by more than 1 % from the median step, or if this is negative. For any other column it
-    is True if no step does and the median is neither 0 nor 1; but it is False if the column is
-    named like a force, has a unit of a quantity that is not time, or is named like `x*`, the
-    samples of a wide table.
+    is True if no step differs so and the median is neither 0 nor 1; but it is False if the column
+    is named like a force, has a unit of a quantity that is not time, or is named like `x*`, the
+    samples of a table with a part in each row.
     """
     steps = column.steps
     usual = float(np.median(steps)) if len(steps) else 0.0
@@ -138,9 +141,9 @@ def are_even(steps: Floats, usual: float) -> bool:
 def epoch_of(column: Column) -> str:
     """Return the unit in which a column of times counts from a known day; "" if it does not.
 
-    With it the first number is a time in the years 2000 to 2049, counted from 1970 or from another
-    day that clocks use, and `Column.usual_step` is of a rate of 1 Hz to 1 MHz. The first unit in
-    `EPOCHS` counts.
+    In this unit the first number is a time in the years 2000 to 2049, counted from 1970 or from
+    another day that clocks use, and the usual step (`Column.usual_step`) is that of a rate of 1 Hz
+    to 1 MHz. Of several such units the first in `EPOCHS` is returned.
     """
     for unit, zero in EPOCHS:
         scale = scale_of(unit)
@@ -154,12 +157,13 @@ def epoch_of(column: Column) -> str:
 def form_of(column: Column, p: Proposal) -> str:
     """Return the unit or the form of a column of times; `?` if none is certain.
 
-    The form of dates or times of day comes first, then the unit that the file states or that stands
-    in brackets in the column's name, the unit that dates of today prove (`epoch_of`), the unit in
-    the name, like `ms` of `t_ms`, `t in 0.1 ms` or `millis`, and what the size of the steps
-    proves (`_unit_by_size`). A note on `time.format` in `p` says why it is `?`, or that only the
-    size of the steps says s. If several forms of dates fit, so that day and month can be confused,
-    the form is `?`.
+    A form is a pattern of dates or times of day, like `%d.%m.%Y`; it comes first, and it is `?` if
+    several fit, so that day and month can be confused. If the cells are numbers, the first unit of
+    time among these is returned: the unit that the file states for the column, the unit that dates
+    of today prove (`epoch_of`), the unit in the name, like `ms` of `t [ms]`, `t_ms` or `millis`, or
+    `0.1 ms` of `t in 0.1 ms`, and what the size of the steps proves (`_unit_by_size`). A note on
+    `time.format` in `p`, the description so far, says why the result is `?`, or that only the size
+    of the steps says s.
     """
     forms = column.forms
     if len(forms) > 1:
@@ -182,9 +186,10 @@ def form_of(column: Column, p: Proposal) -> str:
 def _unit_by_size(column: Column, p: Proposal) -> str:
     """Return the unit of time that the steps in a column prove; `?`, with a note, if none.
 
-    If `Column.usual_step` is 0.0002 to 0.019, the unit is s, and a note on `time.format` in `p`
-    says so. Otherwise it is `?`, and the note lists units with the rates that they give. It is `?`,
-    too, if the column has no numbers that change; the note then asks for the form of its cells.
+    If the usual step (`Column.usual_step`) is 0.0002 to 0.019, the unit is s, and a note on
+    `time.format` in `p`, the description so far, says so. Otherwise it is `?`, and the note lists
+    units with the rates that they give. It is `?`, too, if the column has no numbers that change;
+    the note then asks for the form of its cells.
     """
     step = column.usual_step
     if not step:
@@ -209,18 +214,20 @@ def is_rate(step: float) -> bool:
 def propose_rate(p: Proposal, tables: Tables) -> None:
     """Set `time.rate_hz` in `p`, from the median over the recordings of the mean step of time.
 
-    `tables` has the samples of each recording. With `time.sort` the times of each are sorted first.
-    Steps below 0 are left out of the mean, and the rate is rounded to five digits. It is `?`, with
-    a note, if it is not between 1 Hz and 1 MHz, like that of times that only fall; then `time.gap`,
-    the longest step that is allowed, is not looked at. Otherwise `check_steps` checks the times, by
-    the rate and the gap that the description has by then. If it refuses more recordings than 10 %
-    plus one, `time.gap` is set to `?`, with a note on the first. If `traces.lengths` is stated as
-    `resample`, `traces.samples` becomes as many as 99 % of the recordings last; longer ones lose
-    their end when they are read. If all recordings start after 1999 (UTC), `order` is set to
-    `time`, also if the rate is `?`; if they do not, but one clock runs on through all of them, and
-    its order is another one, `order` is `?`. Recordings whose times cannot be read are skipped.
-    Stated keys stay. Raises DataError if a stated format is no form or unit of times, or if a
-    setting in `[time]` is wrong (see `check_forms`).
+    `p` is the description so far; stated keys stay. `tables` has the samples of each recording.
+    With `time.sort` the times of each are sorted first. Steps below 0 are left out of the mean, and
+    the rate is rounded to five digits. It is `?` (the user must answer), with a note, if it is not
+    between 1 Hz and 1 MHz, like that of times that only fall; then `time.gap`, the longest step
+    that is allowed, is not looked at. Otherwise `check_steps` checks the times, by the rate and the
+    gap that the description has by then. If it refuses more recordings than 10 % plus one,
+    `time.gap` is set to `?`, with a note on the first. If recordings of another length are stated
+    to be resampled (`traces.lengths`), `traces.samples` becomes the number of samples for which
+    99 % of the recordings last; longer ones lose their end when they are read. `order` is set to
+    `time` if all recordings start after 1999 (UTC), also if the rate is `?`. If they do not, but no
+    two of them overlap in time, so that one clock runs on through all, and they do not stand in the
+    order of their times, `order` is `?`. Recordings whose times cannot be read are skipped. Raises
+    DataError if a stated format is no form or unit of times, or if a setting in `[time]` is wrong
+    (see `check_forms`).
     """
     clock = p.description.time
     check_forms(clock, TextForm())  # the marks in numbers may be ? by now

@@ -106,11 +106,12 @@ class Column:
 
     @cached_property
     def numbers(self) -> list[Floats]:
-        """The numbers of each recording whose cells are all numbers, as `[text]` writes them.
+        """The numbers of each recording whose cells in this column are all numbers.
 
-        There is an array for each: (rows,), or (1,) if one cell holds for all rows. A word of
-        `text.missing` is NaN. Recordings with other cells are left out, and so are those with a
-        number that is too large for float32.
+        There is a float64 array for each: (rows,), or (1,) if one cell holds for all rows. `form`
+        says how numbers are written; a word that it names as `missing` is NaN. Recordings with
+        other cells are left out, and so are those with a number that is infinite or too large for
+        float32.
         """
         numbers = list[Floats]()
         for table in self.tables:
@@ -146,13 +147,13 @@ class Column:
 
     @cached_property
     def forms(self) -> list[str]:
-        """The forms of dates and times, like `%d.%m.%Y`, that fit all cells of the column.
+        """The forms of dates and times, like `%d.%m.%Y`, that fit the cells of the column.
 
         Only those in `FORMS` are tried; the list is empty if none fits, for example because a cell
         is empty. The first 20 cells and the last cell of each recording are looked at. If an ISO
         date fits, with or without a time of day, it is the only form. Of two forms that differ by a
-        fraction of a second only the one without it counts. A column of datetimes has
-        only the form `iso`. Raises UnreadableError if cells are lists.
+        fraction of a second only the one without it counts. A column of datetimes has only the form
+        `iso`. Raises UnreadableError if cells are lists.
         """
         if self.tables[0].columns[self.name].dtype.kind == "M":
             return [ISO]
@@ -215,8 +216,10 @@ class Proposal:
     def put(self, key: str, value: Any, note: str = "") -> None:
         """Set a key like `time.column`, with a note on it; does nothing if the user stated it.
 
-        A place of the label or the part clears the other places, as `with_values` does, which also
-        tells the errors. An earlier note stays if there is no new one.
+        Of the keys that say where the label stands (like `label.column` and `label.path`), setting
+        one clears the others, and likewise for the part number. An earlier note stays if there is
+        no new one. Raises DataError for an unknown key or a value of the wrong type
+        (`with_values`).
         """
         if key not in self.stated:
             self.description = self.description.with_values({key: value})
@@ -232,8 +235,9 @@ class Proposal:
     def unused(self) -> list[Column]:
         """The columns that have no role in the description yet.
 
-        Columns of the clock, the part, labels, channels and `[rows]`, the column of `order` and the
-        signals of the trigger have one. Raises SettingError for a malformed `windows.trigger`.
+        Columns of the clock, the part, labels and channels have one, those whose words tell which
+        rows are samples (`[rows]`), the column of `order` and the signals of the trigger, the
+        condition at which long recordings are cut. Raises SettingError for a malformed trigger.
         """
         about = self.description
         used = {*word_columns(about), *about.time.column, *signals_of(about)}

@@ -154,6 +154,16 @@ def lines_of(p: Proposal) -> list[str]:
     return [*filter(None, dict.fromkeys(beginnings))]
 
 
+def tables_of(p: Proposal) -> list[Table]:
+    """Return the table of each recording, without columns if it was not looked at.
+
+    The tables that were looked at, `p.tables`, come first, then those of other files in `p.names`.
+    """
+    looked_at = {table.source for table in p.tables}
+    rest = [Table(name, {}, [], path=name) for name in p.names if name not in looked_at]
+    return [*p.tables, *rest]
+
+
 def part_words(source: PartSource, tables: Tables) -> Words:
     """Return the part number of each recording that has one, by the recording's `Table.source`.
 
@@ -241,9 +251,7 @@ def count_sources(p: Proposal, stated: Sequence[LabelSource]) -> dict[LabelSourc
 
     stated : the source that the user stated, `[label]`; empty if there is none.
     """
-    looked_at = {table.source for table in p.tables}
-    tables = [*p.tables]
-    tables += [Table(name, {}, [], path=name) for name in p.names if name not in looked_at]
+    tables = tables_of(p)
     parts = part_words(p.description.part, tables)
     counted = dict[LabelSource, Words]()
     for source in stated or sources_of(p, [table.path for table in tables]):

@@ -29,20 +29,25 @@ MOST_PARTS = 240
 def layout_of(p: Proposal, files: Tables) -> str:
     """Return how the files hold parts, as `Description.layout` names it; `?` if it is not certain.
 
-    `files` has the table of each file that is looked at. These rules come one after another.
-    A part is a workpiece.
-    Several JSON or .ts files, of which the first has one row, are `files`, unless this row has 20
-    or more columns like `x0`, `x1`. Such columns (unless an even clock stands beside them, see
-    `has_even_clock`), or lists of two items or more in the first row of
-    the first table, make it `wide`, or `npz` for an .npz file. It is `long` if a column of the
-    first table may tell the parts apart (`may_tell_parts`), or if a file has several words of a
-    stated `part.column`; unless it is stated, `part.column` is then set in `p` to the only such
-    column with a name like that of a part's number, no word in two files, and at least a quarter as
-    many runs of one word as any such column has, or to `?` with a note;
-    this clears `part.path` and `part.line`, also stated ones. Several files, of which `p.names` may
-    have more than were looked at, are `files`. A single one gives `?`, with a note on what to
-    state. Raises DataError if the lists in 8 rows or more have fewer than 8 items, like the vectors
-    of a force and a torque, and UnreadableError if cells of columns that are looked at are lists.
+    A part is a workpiece, `p` is the description so far, and `files` has the table of each file
+    that is looked at. The first of these rules that applies decides. Several JSON or .ts files, of
+    which the first has one row, are `files` (a part in each), unless this row has 20 or more
+    columns like `x0`, `x1`. Such columns (unless a clock with equal steps stands beside them, see
+    `has_even_clock`), or lists of two items or more in the first row of the first table, make it
+    `wide` (a part in each row), or `npz` for an .npz file. It is `long` (a sample in each row) if a
+    column of the first table may tell the parts apart (`may_tell_parts`), or if a file has several
+    words in a stated `part.column`, the column that tells the parts apart. Several files, of which
+    `p.names` may have more than were looked at, are `files`. A single one gives `?`, with a note on
+    what to state.
+
+    For `long`, unless `part.column` is stated, it is set in `p`, which clears `part.path` and
+    `part.line`, also stated ones. It becomes the only column that may tell the parts apart, is
+    named like a part's number, has one run (successive rows with one word) of each word in all
+    files together, and at least a quarter as many runs as any column that may tell the parts apart;
+    if there are none or several, it becomes `?` with a note.
+
+    Raises DataError if the lists in 8 rows or more have fewer than 8 items, like the vectors of a
+    force and a torque, and UnreadableError if cells of columns that are looked at are lists.
     """
     kind = p.description.format
     first = files[0]
@@ -80,11 +85,10 @@ def layout_of(p: Proposal, files: Tables) -> str:
 
 
 def has_even_clock(table: Table) -> bool:
-    """Return whether a column with a clock's name (`CLOCK_NAME`) increases in 8 equal steps or
-    more.
+    """Return whether a column that is named like a clock increases in 8 equal steps or more.
 
     All its cells are numbers, with a decimal point or comma, and a step may differ from the median
-    by 1 %. The rows are then samples.
+    by 1 %. If so, the rows are samples, not parts.
     """
     import pandas as pd
 
@@ -110,11 +114,11 @@ def has_long_runs(column: Column) -> bool:
 def may_tell_parts(column: Column) -> bool:
     """Return whether a column may tell which part a row belongs to.
 
-    A run is one word in successive rows. The runs must have 8 rows or more on average, and each
-    word one run; if the column is named like a part's number (`part`, `serial`, `id`, ...), one run
-    in each table. False if a cell is empty, if each table has one word in all its rows, and for a
-    column that is not named like a part's number, but holds times or is named like them. Raises
-    UnreadableError if cells are lists.
+    A run is a stretch of successive rows with one word. The runs must have 8 rows or more on
+    average, and each word must have only one run in all tables together, or, if the column is named
+    like a part's number (`part`, `serial`, `id`, ...), in each table. False if a cell is empty, if
+    each table has one word in all its rows, and for a column that is not named like a part's
+    number, but holds times or is named like them. Raises UnreadableError if cells are lists.
     """
     if not has_long_runs(column):
         return False
@@ -136,12 +140,14 @@ def numbered_columns(table: Table) -> list[str]:
 def parts_of(p: Proposal, files: Tables) -> list[Table]:
     """Return the tables of the first 240 parts without damage, by the layout in `p.description`.
 
+    `p` has the description so far, which is not changed, and the layout says how files hold parts.
     `files` has the table of each file that is looked at, at least one. In the layout `long` a file
-    holds several parts, one below the other; if any file was read only in part, the last of several
-    parts of each file is left out, since it may be cut. In `columns` each column is a part; if
-    channels are stated, only each that fits the first of them. But those in `[rows]`, a stated
-    `time.column`, and those that are named like a clock in the first file, are no parts. Nothing is
-    set in `p`. Raises DataError if a file of the layout `long` does not have the columns in
+    holds several parts, one below the other; if any file was read only to some row, the last of
+    several parts of each file is left out, since it may be cut. In `columns` each column is a part;
+    if channels are stated, only each column that fits the first of them. But columns whose words
+    tell which rows are samples (`[rows]`), a stated `time.column`, and columns that are named like
+    a clock in the first file, are no parts. Damage is for example a line with a wrong number of
+    cells. Raises DataError if a file of the layout `long` does not have the columns in
     `part.column`, if none is stated, or if their cells are lists; and UnreadableError if the
     columns like `x0`, `x1` of one channel differ in length.
     """

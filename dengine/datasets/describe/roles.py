@@ -12,15 +12,15 @@ import numpy as np
 from ...errors import DataError, listed
 from ..description import ANY, UNKNOWN, LabelSource, PartSource, RowWords, expect_one_of
 from ..read.files import natural_key
-from ..read.places import without_label, without_suffix
 from ..read.recordings import is_dropped, kept_rows
 from ..read.split import match_numbered
 from ..units import quantity_of
 from .clock import COUNTER_NAME, is_clock, propose_clock, propose_rate
 from .clock import NAME as CLOCK_NAME
 from .columns import FORCES, LOST, MOST_WORDS, Column, Proposal, columns_of, counts_of
-from .labels import NAME, WORD, has_meaning, lines_of, part_words, propose_label
+from .labels import NAME, has_meaning, lines_of, part_words, propose_label
 from .layout import PART_NAME
+from .order import propose_order
 
 SPARSE = 0.1
 STRANGE = 0.01
@@ -38,9 +38,8 @@ SIGNAL = re.compile(r"(?i)(force|kraft|torque|drehmoment|load|last)([_ ]?[xyz])?
 LOADS = ("force", "torque")
 SENTINEL = re.compile(
     r"(?i)[-+]?(9{4,}([.,](0+|9+))?|1([.,]0+)?e\+?3\d|9[.,]9\d*e\+?37|3[.,]40\d*e\+?38)"
-    r"|-999[.,](25|0+)"
+    r"|-999[.,](25|0+)|32767|-32768"
 )
-STAMP_NAME = re.compile(r"(?i)stamp|stempel|created|date|datum|epoch")
 WORD_BEGINS = r"(?i)(^|[^a-z]|(?-i:(?<=[a-z])(?=[A-Z])))"  # also in `forceUnit`
 SCALE_NAME = re.compile(
     WORD_BEGINS + r"(unit(?!.*(serial|id|no|nr|under))|uom|einheit|scale|scaling"
@@ -48,20 +47,6 @@ SCALE_NAME = re.compile(
     r"|(sampl\w*|abtast|scan|data)[ _]?(rate|freq\w*))s?($|[^a-z])"
 )
 SET_VALUE = re.compile(WORD_BEGINS + r"(set|soll|vorgabe|nominal|target|consigne|max|min|limit)")
-
-# Dates in names. Those in the group `odd` are not sorted by name: they have the day or the month
-# first, the month as a word, or AM and PM.
-DATE = re.compile(
-    r"(?i)(?P<odd>(?<![a-z])(jan|feb|m[aä]r|apr|ma[iy]|jun|jul|aug|sep|o[ck]t|nov|de[cz])(?![a-z])"
-    r"|\d ?[ap]m(?![a-z])|(?<!\d)\d\d?([-_])\d\d?\3(19|20)\d\d(?!\d)"
-    r"|(?<!\d)[0-3]\d[01]\d20[0-3]\d(?!\d)|(?<!\d)[0-3]\d([-_.])[01]\d\5\d\d(?!\d))"
-    r"|(?<!\d)(19|20)\d\d([-_.]?)[01]\d\7[0-3]\d"
-)
-UUID = re.compile(r"(?i)(?<![0-9a-f])[0-9a-f]{8}(-?[0-9a-f]{4}){3}-?[0-9a-f]{12}(?![0-9a-f])")
-ODD = (
-    "name, if that is the order; the names have dates that are sorted otherwise: rename the files, "
-    "with year, month and day in front"
-)
 
 
 def propose_roles(p: Proposal) -> None:
@@ -203,17 +188,25 @@ def propose_part(p: Proposal) -> None:
 
     Its name must be like that of a part's number, and it must have more different words than half
     the number of `p.tables`. Recordings in which it is missing, empty or changes give no word.
-    Columns that have a role are left out, and the lines are those of the first table. If none
-    qualifies, or several do, nothing is set. A `[part]` that is set already stays. Raises
+    Columns that have a role are left out, and the lines are those of the first table. If several
+    qualify, nothing is set. If none does, but in a table with a row for each part such a column has
+    several words, at most half as many as rows, and `[rows]` is empty, `part.column` is `?`, with a
+    note: the rows may be pieces of a curve. A `[part]` that is set already stays. Raises
     SettingError for a malformed `windows.trigger`.
     """
-    sources = [
-        source
+    about = p.description
+    counts = {
+        source: len({*part_words(source, p.tables).values()})
         for source in sources_named(p, PART_NAME, PART_LINE)
-        if len({*part_words(source, p.tables).values()}) > len(p.tables) / 2
-    ]
-    if p.description.part == PartSource() and len(sources) == 1:
-        p.description = replace(p.description, part=sources[0])
+        if about.part == PartSource()
+    }
+    many = [source for source, n in counts.items() if n > len(p.tables) / 2]
+    names = [source.line or source.column[0] for source, n in counts.items() if n > 1]
+    if len(many) == 1:
+        p.description = replace(about, part=many[0])
+    elif names and about.layout == "wide" and not (many or about.rows):
+        text = f"{listed(names)}, or []: is a number in several rows a part that came again?"
+        p.put("part.column", UNKNOWN, f"{text} Pieces of a curve must be joined first")
 
 
 def propose_channels(p: Proposal, units: Mapping[str, str]) -> None:
@@ -371,43 +364,3 @@ def propose_lengths(p: Proposal) -> None:
             p.description.traces.samples or usual,
             note if n_filled > SPARSE * len(lengths) else "",
         )
-
-
-def propose_order(p: Proposal) -> None:
-    """Set `order` in `p` to `?`, with a note, if the file names, sorted, need not be the order.
-
-    That is so if the files of the folders, one folder after the other, have another order, with the
-    text of `label.path` and folders named like a verdict left out (not looked at while
-    `label.column` is `?`), or if two folders have a file of one name; if a file name has a date
-    with the day or the month first, the month as a word, or AM or PM, by which names do not sort;
-    if the names are not in the order of their dates; if all names have random numbers (UUIDs); if
-    the part numbers are sorted as texts (P10 before P2); or if a column of `p.unused` has one word
-    (text of a cell) per recording, which is a date or time or whose name says so (`timestamp`,
-    `created`), and these, as `natural_key` sorts texts, are in another order. If several of these
-    hold, the note is on the last. An `order` that the user stated stays. Raises SettingError for a
-    malformed `windows.trigger`.
-    """
-    paths = [without_label(p.description.label, without_suffix(name)) for name in p.names]
-    names = sorted((path.rpartition("/")[2] for path in paths), key=natural_key)
-    # A folder of a verdict is no step of the production, even if the label stands elsewhere.
-    paths = [re.sub(rf"(?i)(?<![^/])({WORD})/", "", path) for path in paths]
-    by_folder = [path.rpartition("/")[2] for path in sorted(paths, key=natural_key)]
-    # While it is open where the label stands, any folder may be one of a verdict.
-    is_clear = by_folder == names and len({*names}) == len(names)
-    if p.description.label.column != UNKNOWN and not is_clear:
-        p.put("order", UNKNOWN, "name: by file name, or path: folder by folder")
-    matches = [*filter(None, map(DATE.search, names))]
-    dates = [match.string[match.start() :] for match in matches]
-    if any(match["odd"] for match in matches) or dates != sorted(dates, key=natural_key):
-        p.put("order", UNKNOWN, ODD)
-    if names and all(map(UUID.search, names)):
-        p.put("order", UNKNOWN, "name, or path: are random names in the order of production?")
-    numbers = [*part_words(p.description.part, p.tables).values()]
-    if numbers == sorted(numbers) != sorted(numbers, key=natural_key):
-        name = listed(p.description.part.column) or "path"
-        p.put("order", UNKNOWN, f"name, or {name}: part numbers are sorted as texts, 10 before 2")
-    for column in p.unused:
-        if column.forms or STAMP_NAME.search(column.name):
-            ranks = [*map(natural_key, column.fixed)]
-            if ranks != sorted(ranks):
-                p.put("order", UNKNOWN, f"name, or {column.name}, whose dates have another order")

@@ -63,19 +63,21 @@ class Look(NamedTuple):
 def look(content: bytes, stated: Stated) -> Look:
     """Return how a text file is written, and the cells of its samples.
 
-    Only its first 2 million characters are looked at. The result has the text form, the number of
-    cells in a row, whether a delimiter ends each row (its last cell is then empty), the line of the
-    header ("" for none) and the cells of each line from the first row of samples on, also of lines
-    of another form. The delimiter, which is the one that best splits the lines into numbers, and
-    the first row follow from the first 200 lines; of equally good delimiters the one with more
-    cells is taken. If none splits the usual line into cells, there is a single column, and the
-    delimiter is a semicolon, or the stated one. The decimal mark and the mark of thousands are not
-    looked for: the text form has the defaults. `content` has the bytes of the file. Raises
-    DataError if it is empty or no text, or if the line of its header is not certain, and
-    LookupError for a stated encoding that Python does not know.
+    Only its first 2 million characters are looked at. The result has the text form (encoding,
+    delimiter, lines of the header, of the units and of the first samples), the number of cells in a
+    row, whether a delimiter ends each row (its last cell is then empty), the line of the header (""
+    for none) and the cells of each line from the first row of samples on, also of lines of another
+    form. The delimiter, which is the one that best splits the lines into numbers, and the first row
+    follow from the first 200 lines; of equally good delimiters the one with more cells is taken. If
+    none splits the usual line into cells, there is a single column, and the delimiter is a
+    semicolon, or the stated one. The decimal mark and the mark of thousands are not looked for: the
+    text form has the defaults. `content` has the bytes of the file. Raises DataError if it is empty
+    or no text, or if the line of its header is not certain, and LookupError for a stated encoding
+    that Python does not know.
 
     stated : keys that the user gave. `text.encoding` and `text.delimiter` are taken, and so is
-    `text.header` if it is a text; a number only says that a doubt about the header is no error.
+    `text.header` if it is a text, with which the header begins; a number only says that a doubt
+    about the header is no error.
     """
     encoding, text = decode(content, stated.get("text.encoding", ""))
     lines = text.rstrip("\n").split("\n")
@@ -118,11 +120,12 @@ def _share_of_numbers(lines: Sequence[str], delimiter: str) -> tuple[float, int,
     The score says how well the delimiter splits the lines into numbers. It is the share of lines
     with the most frequent number of cells, times the share of numbers among their cells that are
     not empty, plus 0.01; it is divided by 1.15 if the delimiter is a blank, since cells may have
-    blanks in them, and rounded to two decimals, so that near scores are equal. If the most frequent
-    number is below 2, all these cells are empty, or a line is like `5,04` or `RUN;5,4`, with a
-    decimal comma, and the delimiter is a comma, the result is a score of 0 and a single cell. The
-    first third of the lines, which may be text above the samples, and empty lines are left out, but
-    a decimal comma counts in any line; alone in a line, only with a 0 behind it.
+    blanks in them, and rounded to two decimals, so that near scores are equal. The first third of
+    the lines, which may be text above the samples, and empty lines are left out. The result is a
+    score of 0 and a single cell if the most frequent number is below 2, if all these cells are
+    empty, or if the delimiter is a comma and any line, also of the first third, has a decimal
+    comma: a line like `RUN;5,4` with another delimiter beside the number, or like `5,04`, with a 0
+    behind the comma, if it has only the number.
     """
     rows = [split_line(line, delimiter) for line in lines[len(lines) // 3 :] if line.strip()]
     width = mode([*map(len, rows), 0])
@@ -138,13 +141,15 @@ def _share_of_numbers(lines: Sequence[str], delimiter: str) -> tuple[float, int,
 def _first_row(rows: Rows, width: int) -> int:
     """Return the index of the first row of samples, from 0; 0 if there is none.
 
-    `rows` has the cells of each line, of which `width` is the usual number. It is the first of four
-    successive rows, or fewer at the end, that have `width` cells and enough numbers: one, and 60 %
-    of the median of the numbers per row. The median leaves out the first third of the rows; a row
-    of another width counts as 0. Rows directly above belong to the samples, too, if they have
-    `width` cells and their first cell differs only by a number and is not empty: `0.0,,` above
-    `0.1,5,` (a lost sample), but not `time,force,`. If the row found is a numbering
-    (`is_numbering`) and the row below it is none, it names columns, and the row below is the first.
+    `rows` has the cells of each line, of which `width` is the usual number. A row has enough
+    numbers if it has `width` cells, and among them at least one number and 60 % of the median of
+    the numbers per row. The median leaves out the first third of the rows; a row of another width
+    counts as 0. The first of four successive rows with enough numbers, or of fewer at the end, is
+    the first row of samples. Rows directly above belong to the samples, too, if they have `width`
+    cells and their first cell differs only by a number and is not empty: `0.0,,` above `0.1,5,` (a
+    lost sample), but not `time,force,`. If the row found has 20 or more numbers that increase
+    (`is_numbering`), and the row below it does not, it names columns, and the row below is the
+    first.
     """
     counts = [len([*filter(NUMBER.fullmatch, row)]) * (len(row) == width) for row in rows]
     least = max(0.6 * float(np.median(counts[len(counts) // 3 :])), 1)
@@ -175,14 +180,15 @@ def is_numbering(cells: Sequence[str]) -> bool:
 def _head_lines(rows: Rows, width: int, stated: Stated) -> tuple[int, int]:
     """Return the lines, from 1, of the header and of the units above the samples; 0 for none.
 
-    A candidate is a line of at least `width` cells, the number of columns, of which one is neither
-    empty nor a row of dashes. A candidate of units only, right below a candidate with at most half
-    units, is the line of the units, and the one above it the header, if all lines from there to the
-    last candidate are candidates. If there is no such pair, the header is the last candidate; but
-    if more than half of its cells are units, and there is an earlier candidate, it is the line of
-    the units, and the earlier one the header. Raises DataError, unless `stated` has the key
-    `text.header` (its value is not used here), if a header of this second rule has a unit, or a
-    name twice, and the candidate before it has no empty cell.
+    A candidate for either is a line of at least `width` cells, the number of columns, of which one
+    is neither empty nor a row of dashes. First a pair is looked for, from below: a candidate with
+    nothing but units is the line of the units, and a candidate right above it, of whose cells at
+    most half are units, the header; all lines from there to the last candidate must be candidates.
+    If there is no such pair, the header is the last candidate; but if more than half of its cells
+    are units, and there is an earlier candidate, it is the line of the units, and the earlier one
+    the header. Raises DataError if a header of this second rule has a unit, or a name twice, and
+    the candidate before it has no empty cell, so that either may be the header; but not if
+    `stated`, the keys that the user gave, has `text.header` (its value is not used here).
 
     rows : the cells of the lines above the samples.
     """
@@ -221,14 +227,15 @@ def _share_of_units(row: Sequence[str]) -> float:
 def propose_form(p: Proposal, contents: Mapping[str, bytes], faults: list[Fault]) -> Sequence[str]:
     """Set `[text]` in `p` to the text form of most files; return the names of these files.
 
-    Files with another delimiter, number of columns or header are left out: they move from `p.names`
-    to `p.others`. If two or more of them have at least 8 rows of samples, or if a single one has,
-    and its name differs by a number only from that of a file in the result, `exclude` is set to `?`
+    `p` is the description so far, and `[text]` its section on how text files are written. Files
+    with another delimiter, number of columns or header are left out: they move from `p.names` to
+    `p.others`. If two or more of them have at least 8 rows of samples, or if a single one has, and
+    its name differs by a number only from that of a file in the result, `exclude` is set to `?`
     (the user must answer), with a note that asks whether they are recordings. For a file that is no
-    text, or whose header is not certain, a fault is appended to `faults`, and it stays in
-    `p.names`; if all are such, nothing is set, and the result is empty. Of equally frequent forms
-    that of the file with the most cells counts. Keys that the user stated stay. Raises LookupError
-    for a stated encoding that Python does not know.
+    text, or whose header is not certain, a fault (why it cannot be read) is appended to `faults`,
+    and it stays in `p.names`; if all are such, nothing is set, and the result is empty. Of equally
+    frequent forms that of the file with the most cells counts. Keys that the user stated stay.
+    Raises LookupError for a stated encoding that Python does not know.
 
     contents : the contents of the files that are looked at, by name.
     """
@@ -254,10 +261,12 @@ def propose_form(p: Proposal, contents: Mapping[str, bytes], faults: list[Fault]
 def _propose_keys(p: Proposal, looks: Sequence[Look]) -> None:
     """Set the keys of `[text]` in `p` to the form of the first of these files.
 
-    If the header stands at different lines, or the user stated a text for it, `text.header` becomes
-    its text, and `text.units` and `text.data` are counted from it. If any file is read as cp1252,
-    the first such file counts instead, and a note says that the encoding is guessed.
-    `_column_names` gives `text.names`, which is empty if the user stated a header other than 0.
+    `p` is the description so far, and `[text]` its section on how text files are written. If the
+    header stands at different lines, or the user stated a text for it, `text.header` becomes the
+    text of its line, and `text.units` and `text.data`, the lines of the units and of the first
+    samples, are counted from it. If any file is read as cp1252, the first such file counts instead,
+    and a note says that the encoding is guessed. `_column_names` gives `text.names`, the names of
+    the columns in place of a header; it is empty if the user stated a header other than 0.
     `propose_marks` sets the marks in numbers. Stated keys stay.
 
     looks : how each of the files, which are of one form, is written, and the cells of its samples.
@@ -279,7 +288,7 @@ def _propose_keys(p: Proposal, looks: Sequence[Look]) -> None:
 
 
 def _column_names(usual: Look) -> Sequence[str]:
-    """Return the names for `text.names`; empty if the header names each column.
+    """Return the names of columns for `text.names`; empty if the header names each column.
 
     `#` or `%` at the beginning of the header is skipped. If the header has more cells than there
     are columns, the first are the names; but if the delimiter is a blank, only if the others are
@@ -308,12 +317,12 @@ def _column_names(usual: Look) -> Sequence[str]:
 def propose_marks(p: Proposal, cells: Collection[str]) -> None:
     """Set in `p` the decimal mark and the mark of thousands with which most numbers can be read.
 
-    `1.043,5` can only be read with a decimal comma. The decimal mark is `?`, with a note, if point
-    and comma read as many numbers, or if more than 5 % of the numbers cannot be read at all; but
-    not if no number has a point or comma. The mark of thousands is `?`, with a note, if it is a
-    point or comma, and no number has both a point and a comma: `7,286` may be a fraction. It is ""
-    if no mark reads more numbers. If the decimal mark is stated, only this one is tried. Stated
-    keys stay.
+    `p` is the description so far. `1.043,5` can only be read with a decimal comma. The decimal mark
+    is `?` (the user must answer), with a note, if point and comma read equally many numbers, or if
+    more than 5 % of the numbers cannot be read at all; but not if no number has a point or comma.
+    The mark of thousands is `?`, with a note, if it is a point or comma, and no number has both a
+    point and a comma: `7,286` may be a fraction. It is "" if such a mark lets no further number be
+    read. If the decimal mark is stated, only this one is tried. Stated keys stay.
 
     cells : the different texts in the samples that are numbers with any of these marks.
     """

@@ -30,10 +30,10 @@ PLACE = "place"
 def read_messages(path: Path, topics: Collection[str] | None) -> Iterator[tuple[str, int, Any]]:
     """Yield (topic, time in ns, message) for each message of some topics, in the file's order.
 
-    The time is when the bag's recorder got the message (`log_time`). `topics` None means all
-    topics. Raises DataError if the file is not a .mcap file, or if a package that reads such files
-    is not installed. If the file is damaged, was not closed or cannot be read, the whole messages
-    are yielded first; then UnreadableError is raised.
+    `path` is an MCAP file of a ROS 2 bag. The time is when the bag's recorder got the message
+    (`log_time`). `topics` None means all topics. Raises DataError if the file is not a .mcap file,
+    or if a package that reads such files is not installed. If the file is damaged, was not closed
+    or cannot be read, the whole messages are yielded first; then UnreadableError is raised.
     """
     if path.suffix.lower() != SUFFIX:
         raise DataError(
@@ -64,13 +64,14 @@ def read_bag(
 ) -> Table:
     """Return a table with a row for each message that has the channels, in the order of `log_time`.
 
-    Its columns are the channels, `log_time`, when the bag's recorder got the message, and `stamp`,
-    the time in the message's header, 0 without one; both are in nanoseconds. Topics that are
-    labels, or that `part.column`, the trigger or `order` names, are columns, too; a cell is the
-    field `data` of a message. If a topic is a label, each of its messages stands in the last row
-    that is not later, other rows have NaN; of several messages for one row the first stands there,
-    and those before the first row are left out. Any other topic has its newest message in each row,
-    NaN before the first.
+    The table is that of a ROS 2 bag. Its columns are the channels (numbers of one topic's
+    messages), `log_time`, when the bag's recorder got the message, and `stamp`, the time in the
+    message's header, 0 without one; both are in nanoseconds. Topics that are labels, or that
+    `part.column`, the trigger (the condition at which a part begins) or `order` names, are columns,
+    too; a cell is the field `data` of a message. If a topic is a label, each of its messages stands
+    in the last row that is not later, other rows have NaN; of several messages for one row the
+    first stands there, and those before the first row are left out. Any other topic has its newest
+    message in each row, NaN before the first.
 
     Parameters
     ----------
@@ -81,10 +82,10 @@ def read_bag(
     title : str
         The bag's name in error messages.
     description : Description
-        Of the bag.
+        How the bag is read: its channels, labels and so on.
     faults : list
-        Gets a fault for each file that is damaged or no MCAP file, or has a message without a field
-        that is read; its messages before that are read.
+        Gets a fault, which says what could not be read, for each file that is damaged or no MCAP
+        file, or has a message without a field that is read; its messages before that are read.
 
     Raises
     ------

@@ -56,18 +56,20 @@ def times_of(table: Table, clock: Clock, form: TextForm) -> Floats:
 
     If times of day fall from one row to the next by more than half a day, midnight has passed,
     unless one of the clock's formats has the date. If a counter falls by more than half of
-    `clock.wrap`, it began again at 0; with a `wrap` of 0 times may fall.
+    `clock.wrap`, the value at which it begins again, it began again at 0; with a `wrap` of 0 times
+    may fall.
 
     Parameters
     ----------
     table : Table
         The rows of a recording.
     clock : Clock
-        The section `[time]`, which has passed `check_forms`, with as many formats as columns. The
-        times in its columns are added up; a column of one cell holds for all rows. A column of
-        datetimes is read as `iso`, whatever its format; state `iso`, by which it is known to have
-        the date. Dates without a time zone are in `zone`. Without columns and formats there is one
-        time, 0.
+        The section `[time]` of the description of the files, which has passed `check_forms`, with
+        as many formats as columns. A format is a unit, `iso` (ISO 8601) or a pattern like
+        `%H:%M:%S`. The times in the columns are added up; a column of one cell holds for all rows.
+        A column of datetimes is read as `iso`, whatever its format; but only if `iso` is stated,
+        times of day in other columns are known to have a date beside them. Dates without a time
+        zone are in `zone`. Without columns and formats there is one time, 0.
     form : TextForm
         The section `[text]`: how numbers are written.
 
@@ -80,8 +82,8 @@ def times_of(table: Table, clock: Clock, form: TextForm) -> Floats:
     ------
     UnreadableError
         If a column is missing, empty or of another length, or a cell is no time of the stated form
-        (a missing number, too), or no single time because clocks are changed, or if the cells of a
-        column have several offsets from UTC.
+        (a missing number, too), or is a time that exists twice or not at all when clocks are
+        changed, or if the cells of a column have several offsets from UTC.
     DataError
         If a format is no unit of time.
     """
@@ -111,11 +113,11 @@ def _dates(table: Table, name: str, unit: str, clock: Clock) -> Floats:
 
     They are in seconds since 1970 (UTC), or since midnight if the cells have no date. `unit` is the
     form of the cells, "iso" or like "%d.%m.%Y"; a comma is read as a point, and the fraction of a
-    second may lack. Dates without a time
-    zone are in `clock.zone`, or UTC if that is empty; times in the hour that comes twice need rows
-    from both, in order. Raises UnreadableError if there is no column `name`, or one of its cells
-    does not have the form, or is no single time because clocks are changed, or if the cells have
-    several offsets from UTC.
+    second may lack. Dates without a time zone are in `clock.zone`, or UTC if that is empty; times
+    in the hour that comes twice when clocks are set back need rows from both, in order. Raises
+    UnreadableError if there is no column `name`, if one of its cells does not have the form, or is
+    a time that exists twice or not at all when clocks are changed, or if the cells have several
+    offsets from UTC.
     """
     import pandas as pd
 

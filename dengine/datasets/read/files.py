@@ -16,6 +16,11 @@ from ..table import UnreadableError
 
 GZIP = ".gz"
 DATE = re.compile(r"(?<![0-9])([0-9]{1,2})\.([0-9]{1,2})\.([0-9]{4})(?![0-9])")
+HALF_DAY = re.compile(r"\d ?[aApP][mM](?![A-Za-z])")
+# Dates and times that are in another order than the numbers in them.
+UNSORTED = re.compile(
+    rf"(?<!\d)\d\d?([-./ ])(\d\d?|[A-Za-z]{{3,9}})\1\d{{2,4}}(?!\d)|{HALF_DAY.pattern}"
+)
 BAD = (ValueError, NotImplementedError, OSError, IndexError)  # what an unusable pattern raises
 
 
@@ -66,10 +71,11 @@ def match_files(root: Path, patterns: Sequence[str]) -> set[str]:
 def find_files(root: Path, description: Description) -> list[str]:
     """Return the files that a description names, as paths relative to the folder.
 
-    They are sorted by file name, run_2 before run_10. The file `recordings.toml`, the listings of
-    labels and parts that the description names, and files that match a pattern in `exclude` are
-    left out. If `root` is a file, its name alone is returned, whatever the description says. Raises
-    DataError if no file is left, or for a malformed pattern.
+    The description says how recordings are read; its `files` and `exclude` are patterns like
+    `*.csv`. The result is sorted by file name, run_2 before run_10. The file `recordings.toml`,
+    files that list labels or parts, if the description names them, and files that match a pattern
+    in `exclude` are left out. If `root` is a file, its name alone is returned, whatever the
+    description says. Raises DataError if no file is left, or for a malformed pattern.
     """
     if root.is_file():
         return [root.name]
@@ -104,8 +110,9 @@ def read_file(path: Path) -> bytes:
 def caught(faults: list[Fault], source: str) -> Iterator[None]:
     """Context manager that turns a DataError in its block into a fault, and suppresses it.
 
-    The fault is appended to `faults`. It has `source` as the file or part, and the line and column
-    of the error, if it has them. All other exceptions pass.
+    The fault, which says why a file or recording is left out, is appended to `faults`. It has
+    `source` as the file or part, and the line and column of the error, if it has them. All other
+    exceptions pass.
     """
     try:
         yield

@@ -29,10 +29,10 @@ def read_objects(content: bytes, source: str, form: TextForm, has_lines: bool) -
 
     `content` may hold one object, a list of objects, or (with `has_lines`) these in each line, with
     empty lines between them. Keys of nested objects are joined by dots. A cell may be a list; it is
-    None if the object lacks the key. `source` is the file's name in errors; of `form` the encoding
-    is used. Raises UnreadableError if the file is not in this encoding, or the text is no JSON, or
-    holds anything but objects, or nothing, and LookupError for an encoding that Python does not
-    know.
+    None if the object lacks the key. `source` is the file's name in errors; of `form`, how texts
+    are written, only the encoding is used. Raises UnreadableError if the file is not in this
+    encoding, or the text is no JSON, or holds anything but objects, or nothing, and LookupError for
+    an encoding that Python does not know.
     """
     text = to_utf8(content, form.encoding).decode()
     rows: Rows = []
@@ -66,11 +66,12 @@ def columns_of(prefix: str, value: Any) -> Columns:
     """Return a value of JSON or NumPy as columns by name; a scalar becomes a column with one cell.
 
     A list of scalars becomes one column, a mapping has a column for each key, and a list of
-    mappings for each key of the first of them (or, if they are curves with names, for each name and
-    key, see `_turned`). An array or list of lists (C, n) with C <= n, or (n, C) with C < n, has a
-    column for each of its C channels. Nested values are treated in the same way; an empty list is a
-    column without cells, an empty mapping none. Raises UnreadableError if the items of a list whose
-    first item is a list or mapping are not all alike.
+    mappings one for each key of the first of them; but if they are curves with names, like
+    `{"name": "force", "data": [...]}`, one for each name and key (see `_turned`). An array or list
+    of lists (C, n) with C <= n, or (n, C) with C < n, has a column for each of its C channels.
+    Nested values are treated in the same way; an empty list is a column without cells, an empty
+    mapping none. Raises UnreadableError if the items of a list whose first item is a list or
+    mapping are not all alike.
 
     prefix : the name of the value; a dot and the key, or the channel from 0, are appended. Without
     a name, "", a column is called by the key alone.
@@ -96,10 +97,10 @@ def columns_of(prefix: str, value: Any) -> Columns:
 def _turned(value: Any) -> Mapping[Any, Any] | None:
     """Return a list of mappings as one mapping of lists by key, a list of lists as one by channel.
 
-    Mappings that hold lists, like `{"name": "force", "data": [...]}`, are returned unchanged by
-    name instead, if the values under some key are texts that are all different, and a list in the
-    first mapping is longer than there are mappings; the first such key has the names. Otherwise
-    keys that the first mapping lacks are left out.
+    But mappings like `{"name": "force", "data": [...]}` are returned unchanged, by their names, if
+    the values under some key are texts that are all different, and a list in the first mapping is
+    longer than there are mappings; the first such key has the names. Otherwise keys that the first
+    mapping lacks are left out.
 
     The shorter axis of a list of lists is the channels (of equal ones the first), which are
     numbered from 0. A NumPy array counts as a list. A mapping is returned as it is, and None for
@@ -143,8 +144,8 @@ def read_frame(frame: Any, source: str) -> Table:
 
     An index without a name, of one level and not of times, is left out; one of times becomes the
     column `index`. `source` is the table's name in errors. Names of columns become texts, which
-    must differ: this is not checked. Rows are numbered from 1. Raises ValueError if
-    the index is named like a column.
+    must differ: this is not checked. Rows are numbered from 1. Raises ValueError if the index is
+    named like a column.
     """
     is_plain = frame.index.names == [None] and frame.index.dtype.kind not in "mM"
     frame = frame.reset_index(drop=is_plain)
@@ -156,8 +157,8 @@ def read_parquet(content: bytes, source: str) -> Table:
     """Return the table of a Parquet file.
 
     `content` has its bytes, and `source` is its name in errors. An index that pandas stored in it
-    is read as `read_frame` does. Raises DataError if it is no Parquet
-    file or is damaged, or if pyarrow is not installed.
+    becomes a column, or several; a plain one without a name is left out (see `read_frame`). Raises
+    DataError if it is no Parquet file or is damaged, or if pyarrow is not installed.
     """
     with read_errors(source, "a Parquet file", "pyarrow", "files"):
         import pandas as pd
@@ -168,12 +169,13 @@ def read_parquet(content: bytes, source: str) -> Table:
 def read_npz(content: bytes, source: str, has_all: bool) -> Table:
     """Return the table of a NumPy archive, which holds one part, or all parts if `has_all`.
 
-    Of one part, axes of length 1 are dropped; then an array (n,) becomes a column, and an array
-    (C, n), or (n, C) with C < n, a column for each channel. Of all parts, each array is a column
-    whose cell i is its item i, and there are as many rows as the array with most numbers has items;
-    an array with more or fewer items stays as it is. `content` has the bytes of the archive, and
-    `source` is its name in errors. Raises DataError if it is no archive, is damaged, has Python
-    objects or needs too much memory (`read_archive`), and UnreadableError if it has no array.
+    A part is a workpiece. For one part, axes of length 1 are dropped; then an array (n,) becomes a
+    column, and an array (C, n), or (n, C) with C < n, a column for each channel. For all parts,
+    each array is a column whose cell i is its item i, and there are as many rows as the array with
+    most numbers has items; an array with more or fewer items stays as it is. `content` has the
+    bytes of the archive, and `source` is its name in errors. Raises DataError if it is no archive,
+    is damaged, has Python objects or needs too much memory (`read_archive`), and UnreadableError if
+    it has no array.
     """
     arrays, _ = read_archive(content, name=source)
     if not arrays:
@@ -191,9 +193,9 @@ def read_ts(content: bytes, source: str, form: TextForm) -> Table:
     Channels are the columns `0`, `1`, ..., whose cells are lists of texts; the class is the column
     `class`, always the text behind the last colon of the line. A series with fewer channels than
     others has None for each that is missing. `content` has the bytes of the file, `source` is its
-    name in errors, and of `form` the encoding is used. Raises UnreadableError if the file is not in
-    this encoding, or has no series below a line `@data`, and LookupError for an encoding that
-    Python does not know.
+    name in errors, and of `form`, how texts are written, only the encoding is used. Raises
+    UnreadableError if the file is not in this encoding, or has no series below a line `@data`, and
+    LookupError for an encoding that Python does not know.
 
     References
     ----------

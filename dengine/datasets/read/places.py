@@ -58,13 +58,13 @@ def path_word(path: str, pattern: str) -> str:
 
 
 def line_word(lines: Sequence[str], beginning: str) -> str:
-    """Return the word behind `beginning` in a line that begins with it, "" if there is none.
+    """Return the word behind `beginning` in a line that begins with it, "" if nothing is there.
 
-    If several lines begin with it, those are used in which it fills the whole first cell, or else
-    all. Comment marks, quotes and delimiters before `beginning` are skipped. So are blanks, tabs,
-    quotes and `; , : =` behind it; then the word goes up to the next `;`, tab or comma, without
-    such marks at its end. Raises UnreadableError if no line begins with the text, or if the words
-    of several differ.
+    If several lines begin with it, those are used in which it fills the whole first cell; if there
+    are none of these, all. Comment marks, quotes and delimiters before `beginning` are skipped. So
+    are blanks, tabs, quotes and `; , : =` behind it; then the word goes up to the next `;`, tab or
+    comma, without such marks at its end. Raises UnreadableError if no line begins with the text, or
+    if the words of several differ.
 
     lines : the lines above the header of a file.
     """
@@ -86,12 +86,14 @@ def words_of(
 ) -> list[str]:
     """Return the words that a source of labels or of part numbers has for a recording.
 
-    If the source states a path or a line above the header, that gives one word; otherwise each of
-    `columns` of the recording's table gives one, "" for an empty cell: that of all rows if `at` is
-    "same", or of the "first" or "last" row. Raises UnreadableError if a column, the line or a match
-    of the path is missing, if a column has lists or no rows, or if rows differ under "same" or the
-    words of several such lines do, and DataError if the path is no regular expression with one
-    group.
+    A word is a text like "ok" or a part number, and `source` says where it stands. If it states a
+    regular expression for the path of the file, or the beginning of a line above the header, that
+    gives one word. Otherwise each of `columns` of the recording's table gives one, "" for an empty
+    cell: that of all rows if `at` is "same", or of the "first" or "last" row. Raises
+    UnreadableError if a column, the line or a match in the path is missing, if a column has lists
+    or no rows, if the words of the rows differ and `at` is "same", or if several lines with this
+    beginning have different words. Raises DataError if what is stated for the path is no regular
+    expression with exactly one group.
     """
     if source.path:
         return [path_word(table.path, source.path)]
@@ -101,12 +103,14 @@ def words_of(
 
 
 def part_of(source: PartSource, table: Table) -> str:
-    """Return the part number of a recording by `[part]`, `source`; "" if that states nothing.
+    """Return the part number of a recording; "" if `source` states nothing.
 
-    The words of several columns are joined by blanks. Raises UnreadableError if a stated column,
-    line or match is missing or its word is empty, if the words of the recording's rows, or of
-    several lines with the stated beginning, differ, or if a column has lists or no rows; and
-    DataError if the stated path is no regular expression with one group.
+    `source` says where the number stands: in columns of the recording's table, in the path of its
+    file or in a line above the header. The words of several columns are joined by blanks. Raises
+    UnreadableError if a stated column, line or match in the path is missing or its word is empty,
+    if the words of the recording's rows, or of several lines with the stated beginning, differ, or
+    if a column has lists or no rows; and DataError if what is stated for the path is no regular
+    expression with one group.
     """
     words = words_of(source, table, source.column)
     if not all(words):
@@ -117,13 +121,14 @@ def part_of(source: PartSource, table: Table) -> str:
 def listing_table(path: Path, form: TextForm) -> Table:
     """Return the table of a listing, which is a Parquet file or a text file.
 
-    A name that ends in `.parquet` tells the first; a text whose name ends in `.gz` is unpacked. The
-    first line of a text has the names of the columns; the delimiter is the first of `, ; tab |`
-    that is most frequent in it. Cells of a text stay texts. Of `form` only the encoding is used; a
-    text that is not in it is read as cp1252. Raises UnreadableError if the file cannot be read, if
-    a text has a zero byte, an empty first line or nothing below it, or if a row of a text has
-    another number of cells; DataError for a damaged Parquet file or without pyarrow; and
-    LookupError for an encoding that Python does not know. A Parquet file may have no rows.
+    A listing has a row for each recording or part, for example with its label. It is a Parquet file
+    if its name ends in `.parquet`; a text whose name ends in `.gz` is unpacked. The first line of a
+    text has the names of the columns; the delimiter is the first of `, ; tab |` that is most
+    frequent in it. Cells of a text stay texts. Of `form` only the encoding is used; a text that is
+    not in it is read as cp1252. Raises UnreadableError if the file cannot be read, if a text has a
+    zero byte, an empty first line or nothing below it, or if a row of a text has another number of
+    cells; DataError for a damaged Parquet file or without pyarrow; and LookupError for an encoding
+    that Python does not know. A Parquet file may have no rows.
     """
     content = read_file(path)
     if path.suffix.lower() == ".parquet":
@@ -138,7 +143,8 @@ def listing_table(path: Path, form: TextForm) -> Table:
 def in_listing(name: str) -> Iterator[None]:
     """Context manager that raises DataError in place of an UnreadableError in its block.
 
-    The message names the listing, `name`, and the line.
+    The message names the listing (a file with a row for each recording or part), `name`, and the
+    line.
     """
     try:
         yield
@@ -163,18 +169,19 @@ class LabelReader:
         """Return the word that stands for the label of a recording, like "ok".
 
         `table` is the table of the recording, and `part` its part number. If the source is a
-        listing, it is the word of all its rows with the key of the recording. The key is the first
-        of these that is listed: the number of the part, the path, the file name, the path without
-        suffix, the file name without suffix; they are compared as `as_key` writes them, so 0012 is
-        12. A word is "" if its cell is empty. The key is added to `used`, the keys found so far.
+        listing (a file with a row for each recording or part), it is the word of all its rows with
+        the key of the recording. The key is the first of these that is listed: the number of the
+        part, the path, the file name, the path without suffix, the file name without suffix; they
+        are compared as `as_key` writes them, so 0012 is 12. A word is "" if its cell is empty. The
+        key is added to `used`, the keys found so far.
 
         Raises
         ------
         UnreadableError
-            If the column, line, match or key is missing, or a column has lists or no rows. If the
-            words differ in such lines, in rows of the listing with the key or, if `source.at` is
-            "same", in the recording's rows. If the key is not the part's number, and was found for
-            another path before.
+            If the column, line, match in the path, or key is missing, or a column has lists or no
+            rows. If the words differ in several such lines, in rows of the listing with the key or,
+            if `source.at` is "same", in the recording's rows. If the key is not the part's number,
+            and was found for another path before.
         DataError
             If `source.path` is no regular expression with one group.
         """
@@ -207,10 +214,11 @@ class LabelReader:
         """Return the label of a recording: 1 good, 0 bad, None not checked.
 
         `table` is the table of the recording, and `part` its part number. If the source is a
-        listing, the key that was found in it is added to `used`, the keys found so far. Words are
-        compared exactly; a word that is stated for several meanings is good before bad, and bad
-        before not checked. Raises what `word` raises, and UnreadableError if the word, which may
-        be empty, has no stated meaning.
+        listing (a file with a row for each recording or part), the key of the recording that was
+        found in it is added to `used`, the keys found so far. The word that stands for the label is
+        compared exactly with the words that `source` states for each meaning; if a word is stated
+        for several, good comes before bad, and bad before not checked. Raises what `word` raises,
+        and UnreadableError if the word, which may be empty, has no stated meaning.
         """
         source = self.source
         word = self.word(table, part)
@@ -225,9 +233,10 @@ class LabelReader:
     def unused_note(self) -> str:
         """Return a sentence on rows of the listing that name no recording, "" if there is none.
 
-        These are the rows whose key is not in `used`, also if their recording failed before its
-        word was looked up. The sentence has up to eight keys, and counts keys: rows with the same
-        key count once.
+        A listing is a file with a row for each recording or part. These are the rows whose key is
+        not in `used`, the keys that were looked up, also if their recording failed before its word
+        was looked up. The sentence has up to eight keys, and counts keys: rows with the same key
+        count once.
         """
         unused = sorted(self.listing.keys() - self.used.keys(), key=natural_key)
         if not unused:
@@ -252,11 +261,12 @@ def as_key(word: str) -> str:
 def read_labels(base: Path, source: LabelSource, form: TextForm) -> LabelReader:
     """Return the reader of a source of labels, after reading its listing, if it has one.
 
-    The listing stands in the folder `base`, and is a Parquet file, or a text in the encoding of
-    `form` or else in cp1252 (see `listing_table`). Raises DataError if it cannot be read, or if
-    `source.key` and `source.column`, the columns of keys and words in it, are not both stated and
-    there, and LookupError for an encoding that Python does not know. Whether `source.path` is a
-    regular expression is not checked here.
+    The source says where the labels stand, and a listing is a file with a row for each recording or
+    part. It stands in the folder `base`, and is a Parquet file, or a text in the encoding of `form`
+    or else in cp1252 (see `listing_table`). Raises DataError if it cannot be read, or if
+    `source.key` and `source.column`, the columns in it that name the recording or part and have the
+    label, are not both stated and there, and LookupError for an encoding that Python does not know.
+    Whether `source.path` is a regular expression is not checked here.
     """
     listing = defaultdict[str, set[str]](set)
     if source.listing:

@@ -22,7 +22,7 @@ from ..table import Recording, Table, UnreadableError, as_word
 from ..units import bare, conversion, unit_in
 from .bags import read_bag
 from .clock import check_steps, times_of
-from .files import caught, find_files, natural_key, read_file
+from .files import DATE, UNSORTED, caught, find_files, natural_key, read_file
 from .frames import read_frame
 from .places import LabelReader, part_of, read_labels, without_label, without_suffix
 from .split import split, table_of
@@ -38,12 +38,15 @@ def recording_of(
 ) -> Recording | None:
     """Return the recording of a part; None if the part was not checked.
 
-    Rows that `[rows]` drops are left out, then rows are sorted by time if `time.sort` is set, and
-    their times are checked (`check_steps`); samples of rows that `[rows]` calls invalid are NaN.
-    The `length` of the recording is the number of rows kept. A reader of a listing adds the key
-    that it found to its `used`. The times and samples of a part that was not checked must be
-    readable, too, but may be of any length. If `[part]` states nothing, a part that `[windows]`
-    cuts has as part number its key in the listing, or its number from 1 if a trigger cuts.
+    The description says how the table of a part is read. Rows that its section `[rows]` drops, by a
+    word in some column, are left out, then rows are sorted by time if `time.sort` is set, and their
+    times are checked (`check_steps`); samples of rows that `[rows]` calls invalid are NaN. The
+    `length` of the recording is the number of rows kept. A reader of a listing, a file with a row
+    for each recording or part, adds the key that it found to its `used`. The times and samples of a
+    part that was not checked must be readable, too, but may be of any length. If the description
+    says nothing of part numbers, a part that was cut out of a long recording (`[windows]`) has as
+    part number its key in the listing of such parts, or its number from 1 if a trigger, a condition
+    on a signal, cuts.
 
     Parameters
     ----------
@@ -91,7 +94,9 @@ def recording_of(
     if order == "path":
         rank = natural_key(without_label(description.label, without_suffix(table.path)))
     elif order not in ORDERS:
-        rank = natural_key(table.one_word(order, "first"))
+        rank = natural_key(word := table.one_word(order, "first"))
+        is_unsorted = UNSORTED.search(DATE.sub("", word)) is not None
+        table.refuse(np.array([is_unsorted]), "dates to sort by, with the year in front", order)
     return Recording(
         table.source,
         fitted(np.stack(samples), seconds, description),
@@ -106,9 +111,10 @@ def recording_of(
 def kept_rows(table: Table, rows: Mapping[str, RowWords]) -> Table:
     """Return a table of the rows that are samples; rows of lost samples stay, unchanged.
 
-    A column takes its words from the rows that the columns before it keep; one of a single cell
-    drops no rows. Raises UnreadableError for a word whose meaning is not stated, and for a column
-    that is missing, has lists or is of another length.
+    A word is the text of a cell, and lost samples are read as NaN later. A column takes its words
+    from the rows that the columns before it keep; a column of a single cell drops no rows. Raises
+    UnreadableError for a word whose meaning is not stated, and for a column that is missing, has
+    lists or is of another length.
 
     rows : for each column, the words that keep a row, drop it, or mark its samples as lost; `*` is
     any other word.
@@ -129,10 +135,11 @@ def samples_of(table: Table, column: str, channel: Channel, form: TextForm) -> F
     """Return the samples of a channel, converted to its unit and times its factor, shape (n,).
 
     The cells of `column` are in the unit that the file states for it, or else in the unit in its
-    name, or else in the channel's unit. `form` says how numbers are written. A lost sample is NaN.
-    Raises UnreadableError if the file and the channel state different units, and these are of
-    different quantities or one is unknown; if the column is missing; or if a cell is no number, is
-    infinite or is too large for float32. A unit of another quantity in the name is ignored.
+    name, or else in the channel's unit. `form` says how numbers are written, and which words stand
+    for a lost sample, which is NaN. Raises UnreadableError if the file and the channel state
+    different units, and these are of different quantities or one is unknown; if the column is
+    missing; or if a cell is no number, is infinite or is too large for float32. A unit of another
+    quantity in the name is ignored.
     """
     values = table.numbers(column, form)
     unit = table.units.get(column)
@@ -150,14 +157,14 @@ def samples_of(table: Table, column: str, channel: Channel, form: TextForm) -> F
 def label_of(labels: Sequence[LabelReader], table: Table, part: str) -> int | None:
     """Return the label of a part, 1 good or 0 bad; None if it was not checked.
 
-    `labels` has a reader for the source of labels, and for each source that must agree with it;
-    `table` and `part` are the table and the number of the part. The reader of a listing, a file
-    with a row for each part or recording, adds the key that it found to its `used`. Raises
-    UnreadableError if a source has no label for the part, a word without a stated meaning or
-    contradictory rows, or if the sources do not agree, also if only one of them says that it was
-    not checked. Raises it also if another file had the key in a listing before, unless the key is
-    the number of the part, which several files may have. Raises DataError if the path of a source
-    is no regular expression with one group.
+    `labels` has a reader for the source of labels (a column, a path, a line or a listing), and for
+    each source that must agree with it; `table` and `part` are the table and the number of the
+    part. The reader of a listing, a file with a row for each part or recording, adds the key of the
+    part that it found to its `used`. Raises UnreadableError if a source has no label for the part,
+    a word without a stated meaning or contradictory rows, or if the sources do not agree, also if
+    only one of them says that it was not checked. Raises it also if another file had the key in a
+    listing before, unless the key is the number of the part, which several files may have. Raises
+    DataError if what a source states for the path is no regular expression with one group.
     """
     by_source = [reader.label(table, part) for reader in labels]
     for i, label in enumerate(by_source):
@@ -175,23 +182,26 @@ def read_recordings(
 ) -> Dataset:
     """Read the recordings that a description describes.
 
+    Recordings are files or tables with the samples of parts; the description says how they are
+    read.
+
     Parameters
     ----------
     source : Path or DataFrame
         A folder, a file or a table.
     description : Description
     progress : callable, optional
-        Called with 1 after each file, also one that cannot be read; once for a bag or a table.
+        Called with 1 after each file, also one that cannot be read; once for a ROS bag or a table.
 
     Returns
     -------
     Dataset
-        Its traces are in the order that `order` of the description states; of equal ones that of
-        the files. A recording that does not follow the description or repeats another is one of its
-        `faults`, and so is a file that cannot be read; of recordings with equal samples and
-        different labels none is kept. One whose part was not checked counts in `unlabelled`.
-        `notes` says if rows of a listing name no recording, or there are fewer recordings than when
-        the description was made.
+        Its traces are in the order that `order` of the description states; equal ones stay in the
+        order of the files. A recording that does not follow the description or repeats another is
+        left out, and one of its `faults` says why, also of a file that cannot be read; of
+        recordings with equal samples and different labels none is kept. One whose part was not
+        checked counts in `unlabelled`. `notes` says if rows of a listing of labels, a file, name no
+        recording, or there are fewer recordings than when the description was made.
 
     Raises
     ------
@@ -200,7 +210,7 @@ def read_recordings(
         `files` is malformed, a bag or a listing of labels cannot be read, no recording is left, or
         `make_dataset` refuses the traces, like those with more channels than samples.
     SettingError
-        If `windows.trigger` is malformed.
+        If `windows.trigger`, the condition at which long recordings are cut, is malformed.
     ValueError
         If the index of the DataFrame is named like one of its columns.
     """
@@ -249,12 +259,13 @@ def files_of(
 ) -> tuple[str, Path, Sequence[str | Table]]:
     """Return the name of a data set, its folder, and what to read: files in it, or a table.
 
-    The data set has the name of the folder, or of the file without its suffix. All files of a bag
-    are read here, into one table; a fault of each damaged one is appended to `faults`. A DataFrame
-    gives one table, called "table", and the current folder. Raises DataError if there is no file, a
-    pattern in `files` is malformed, or the bag cannot be read (see `read_bag`), SettingError if
-    `windows.trigger` of a bag is malformed, and ValueError if the index of the DataFrame is named
-    like one of its columns.
+    The data set has the name of the folder, or of the file without its suffix. The description says
+    how the recordings in the files are read. All files of a ROS bag are read here, into one table;
+    a fault of each damaged one is appended to `faults`. A DataFrame gives one table, called
+    "table", and the current folder. Raises DataError if there is no file, a pattern in `files` is
+    malformed, or the bag cannot be read (see `read_bag`), SettingError if `windows.trigger` of a
+    bag, the condition at which a part begins, is malformed, and ValueError if the index of the
+    DataFrame is named like one of its columns.
     """
     if not isinstance(source, Path):
         return FRAME, Path(), [read_frame(source, FRAME)]
@@ -271,12 +282,14 @@ def files_of(
 def parts_of(file: str | Table, description: Description, base: Path) -> Iterator[Table]:
     """Yield the tables of the parts in a file, or in a table that was read already.
 
-    Each table that `split` yields is one part, or, if `[windows]` is stated, a long recording that
-    is cut into parts. One that `[rows]` drops by a single cell is left out (`is_dropped`). `base`
-    is the folder of the file, and of the listing in `[windows]`. Raises UnreadableError or
-    DataError if the file cannot be read, DataError if it cannot be split, or one of its recordings
-    cannot be cut (those before it are yielded), SettingError if `windows.trigger` is malformed, and
-    LookupError for an encoding that Python does not know.
+    The description says how files are read. Each table that `split` yields is one part, or, if the
+    section `[windows]` is stated, a long recording that is cut into parts. One that the section
+    `[rows]` drops by the word of a single cell is left out (`is_dropped`). `base` is the folder of
+    the file, and of the listing in `[windows]`, a file with the parts' starts and ends. Raises
+    UnreadableError or DataError if the file cannot be read, DataError if it cannot be split, or one
+    of its recordings cannot be cut (those before it are yielded), SettingError if
+    `windows.trigger`, the condition at which a part begins, is malformed, and LookupError for an
+    encoding that Python does not know.
     """
     if not isinstance(file, Table):
         file = table_of(read_file(base / file), file, description)
@@ -286,10 +299,11 @@ def parts_of(file: str | Table, description: Description, base: Path) -> Iterato
 
 
 def is_dropped(part: Table, rows: Mapping[str, RowWords]) -> bool:
-    """Return whether a column of `[rows]` has a single cell for a part, with a word to drop.
+    """Return whether a column in `rows` has a single cell for a part, with a word to drop.
 
-    The whole part is then left out, like a row of a wide table that has the samples of another
-    signal. A column that the part lacks, or a word without a stated meaning, drops nothing.
+    `rows` says by column what words keep or drop a row. The whole part is left out then, for
+    example a row with the samples of another signal, in a table with a row for each part. A column
+    that the part lacks, or a word without a stated meaning, drops nothing.
     """
     for name in rows.keys() & part.columns.keys():
         cells = part.columns[name]
@@ -301,12 +315,13 @@ def is_dropped(part: Table, rows: Mapping[str, RowWords]) -> bool:
 def dataset_of(recordings: Sequence[Recording], description: Description) -> Dataset:
     """Return the data set of recordings, at least one, in the given order.
 
-    `ordered` is False if the label changes exactly once from one recording to the next. `fit` is
-    "strict" if the recordings were resampled at the stated rate of their clock, since live traces
-    then come at this rate; otherwise it is `traces.lengths` of the description, "pad" for
-    "pad-all". (`fit` says what happens to live traces of another length.) `limit`, the range of the
-    sensor, is that of the first channel, None if it is not known. `part` is None if no recording
-    has a part number. Raises DataError if `make_dataset` refuses the traces.
+    `ordered` is False if the label changes exactly once from one recording to the next, since the
+    recordings are then sorted by label. `fit` is "strict" if the recordings were resampled at the
+    stated rate of their clock, since live traces then come at this rate; otherwise it is
+    `traces.lengths` of the description, "pad" for "pad-all". `fit` says what happens to live traces
+    of another length, as `traces.lengths` does for recordings. `limit`, the range of the sensor, is
+    that of the first channel, None if it is not known. `part` is None if no recording has a part
+    number. Raises DataError if `make_dataset` refuses the traces.
     """
     X, labels, parts, sources, lengths = (
         np.array([getattr(recording, key) for recording in recordings])
@@ -334,13 +349,15 @@ def dataset_of(recordings: Sequence[Recording], description: Description) -> Dat
 def fitted(samples: Floats, seconds: Floats | None, description: Description) -> TraceArray:
     """Return the trace (C, T) of samples (C, n), brought to T samples as `[traces]` says.
 
-    `seconds`, shape (n,), has the times of the samples; None without a clock. With
-    `resample`, times and a stated rate, the samples are interpolated at that rate from the first
-    time on. A longer recording loses its end; one that ends up to one step early is accepted, and
-    its last sample repeated. With `resample` and times, but without a rate, the whole recording is
+    This section of the description has T, `samples`, and what happens to another length, `lengths`.
+    `seconds`, shape (n,), has the times of the samples; None without a clock. With `resample`,
+    times and a stated rate, the samples are interpolated at that rate from the first time on. A
+    longer recording loses its end; one that ends up to one step early is accepted, and its last
+    sample repeated. With `resample` and times, but without a rate, the whole recording is
     interpolated evenly, if it has half to twice T samples. Otherwise it is fitted like a live trace
-    (`can_fit_length`, `fit_length`); `pad-all` takes any length but 0, and repeats the last sample
-    or drops the end.
+    (`can_fit_length`, `fit_length`): `strict` takes only T samples, `cut` drops the end, `pad`
+    drops the end or repeats the last sample, and `resample` interpolates evenly, both if there are
+    half to twice T samples. `pad-all` is like `pad`, but takes any length but 0.
 
     Raises
     ------

@@ -22,11 +22,12 @@ OBJECTS = ("json", "jsonl", "ts")
 def table_of(content: bytes, name: str, description: Description) -> Table:
     """Return the table of a file in the format of the description.
 
-    Any other format than `ts`, `json`, `jsonl`, `parquet` and `npz` is read as text. An .npz file
-    is read as all parts, row by row, if the layout is `npz`, `wide` or `long`, otherwise as one
-    part. `content` has the bytes of the file, and `name` is its name in errors. Raises
-    UnreadableError or DataError if the file does not have this format, and DataError without
-    pyarrow for a Parquet file. Raises LookupError for an encoding that Python does not know.
+    Any other format than `ts`, `json`, `jsonl`, `parquet` and `npz` is read as text. The layout of
+    the description says how files hold parts. An .npz file is read as all parts, row by row, if it
+    is `npz`, `wide` or `long`, otherwise as one part. `content` has the bytes of the file, and
+    `name` is its name in errors. Raises UnreadableError or DataError if the file does not have this
+    format, and DataError without pyarrow for a Parquet file. Raises LookupError for an encoding
+    that Python does not know.
     """
     kind = description.format
     form = description.text
@@ -42,10 +43,11 @@ def table_of(content: bytes, name: str, description: Description) -> Table:
 
 
 def word_columns(description: Description) -> set[str]:
-    """Return the columns whose cells are read as words, also if they are channels, too.
+    """Return the columns whose cells are read as words (texts), also if they are channels, too.
 
-    These are dates, times of day, part numbers, labels, the column of `order` and those in
-    `[rows]`. The set also has "" if `[label]` or a `[[check]]` names no column.
+    These are the columns that the description names for dates, times of day, part numbers, labels
+    and `order`, and those whose words tell which rows are samples (`[rows]`). The set also has ""
+    if `[label]` or a `[[check]]`, another source of labels, names no column.
     """
     clock = description.time
     words = {name for name, form in zip(clock.column, clock.format, strict=False) if is_dated(form)}
@@ -78,21 +80,23 @@ def pattern_of(column: str, any_text: str = ".*") -> re.Pattern[str]:
 def split(table: Table, description: Description) -> Iterator[Table]:
     """Yield the table of each part of a file, by the layout of the description.
 
-    `long`: the rows with the same words in `part.column` are a part; they must stand together,
-    unless `time.sort` is set. `columns`: each column that matches the first channel is a part.
-    `wide`, `npz`, and a file of the formats json, jsonl and ts with one row, or with a list of two
-    or more items in its first row: each row is a part; its samples are the list in a cell, or the
-    cells of the columns that match the channel with a number for its `*`, in the order of these
-    numbers. Otherwise the file is one part.
+    A part is a workpiece, and the layout says how files hold parts. `long`: the rows with the same
+    words in `part.column` are a part; they must stand together, unless `time.sort` is set.
+    `columns`: each column that matches the first channel is a part. `wide`, `npz`, and a file of
+    the formats json, jsonl and ts with one row, or with a list of two or more items in its first
+    row: each row is a part; its samples are the list in a cell, or the cells of the columns that
+    match the channel, like `x*`, with a number for its `*`, in the order of these numbers.
+    Otherwise the file is one part.
 
-    In numbered columns and in the layout `columns`, empty cells at the end are no samples. A part
-    has `damage` if its row is damaged, or if a list of lists or mappings in it has items of
-    different keys, kinds or lengths. In `long` damaged rows are in no part; a part has damage if
-    one stands between its first and last row or directly beside these, or if rows of other parts
-    stand between its own without `time.sort`. In `columns` and for a whole file, all damage of the
-    file counts. Raises DataError if `part.column` of the layout `long` is not stated, is not in the
-    table or has lists as cells, UnreadableError if the numbered columns of one channel differ in
-    length, and RuntimeError for the layout `columns` without a channel.
+    In such numbered columns and in the layout `columns`, empty cells at the end are no samples. The
+    `damage` of a table lists errors, for example rows with a wrong number of cells. A part has
+    damage if its row is damaged, or if a list of lists or mappings in it has items of different
+    keys, kinds or lengths. In `long` damaged rows are in no part; a part has damage if one stands
+    between its first and last row or directly beside these, or if rows of other parts stand between
+    its own without `time.sort`. In `columns` and for a whole file, all damage of the file counts.
+    Raises DataError if `part.column` of the layout `long` is not stated, is not in the table or has
+    lists as cells, UnreadableError if the numbered columns of one channel differ in length, and
+    RuntimeError for the layout `columns` without a channel.
     """
     table = replace(table, path=table.source)
     layout = description.layout
@@ -121,10 +125,11 @@ def _split_rows(table: Table, description: Description) -> Iterator[Table]:
     """Yield a table for each part: the rows that have equal words in the columns `part.column`.
 
     The parts come in the order of their first rows, and the words stand in each table's `source`. A
-    row with a wrong number of cells is in no part. A part has damage if such a row stands between
-    its first and its last row, or directly before or behind these. It also has damage if rows of
-    other parts stand between its own and `time.sort` is not set. Raises DataError if `part.column`
-    is not stated, or a column of it is not in the table or has lists as cells.
+    row with a wrong number of cells is in no part. A part has `damage` (errors for which it is left
+    out) if such a row stands between its first and its last row, or directly before or behind
+    these. It also has damage if rows of other parts stand between its own and `time.sort` is not
+    set. Raises DataError if `part.column` is not stated, or a column of it is not in the table or
+    has lists as cells.
     """
     import pandas as pd
 
@@ -152,11 +157,11 @@ def _split_wide(table: Table, description: Description) -> Iterator[Table]:
     the order of these numbers, without empty cells at the end; its unit is that of the first of
     these columns, and they are in no part themselves. Any other cell becomes a column of one cell,
     or, if it is a list or mapping, one column or several (`frames.columns_of`); a column without a
-    cell for each row is in every part as a whole, and an empty one in none. A part has damage if
-    its row had a wrong number of cells. If a list of lists or mappings in it has items that are not
-    all alike, that is its only damage, and it has no columns; a list that begins with a number or
-    text may be mixed. Raises UnreadableError if the columns of a channel like `x*` differ in
-    length.
+    cell for each row is in every part as a whole, and an empty one in none. A part has `damage`
+    (errors for which it is left out) if its row had a wrong number of cells. If a list of lists or
+    mappings in it has items that are not all alike, that is its only damage, and it has no columns;
+    a list that begins with a number or text may be mixed. Raises UnreadableError if the columns of
+    a channel like `x*` differ in length.
     """
     n = len(table.lines)
     origin: dict[str, list[str]] = {}
@@ -204,10 +209,11 @@ def _split_columns(table: Table, description: Description) -> Iterator[Table]:
     """Yield for each column that matches the first channel a table, which is a part.
 
     The channel's name may have a `*` for any text; without a channel RuntimeError is raised. The
-    columns of times and of `[rows]` are in each table, too, and are no parts; other columns are in
-    none. In its table the column has the channel's name, and `path` is its own name. Rows below the
-    last cell of the part that is not empty or NaN are left out. Damage of the file is damage of
-    each part.
+    columns of times, and those whose words tell which rows are samples (`[rows]`), are in each
+    table, too, and are no parts; other columns are in none. In its table the column has the
+    channel's name, and `path` is its own name. Rows below the last cell of the part that is not
+    empty or NaN are left out. `damage` of the file, like rows with a wrong number of cells, is
+    damage of each part.
     """
     channel = next(iter(description.channels))
     shared = {*description.time.column, *description.rows}

@@ -34,26 +34,28 @@ def read_text(
     source : str
         Name of the file, for errors.
     form : TextForm
-        How the file is written: the section `[text]`.
+        How the file is written: the section `[text]` of a description.
     words : container of str, optional
         The columns whose cells are read as texts. The cells of any other column are numbers if the
         file is plain and pandas reads them all as numbers; bools if all are True or False, in any
         of the spellings that pandas knows; otherwise texts. A file is not plain if a row has a
         wrong number of cells, a line or a last cell is empty, a cell has a line break, `form.drop`
-        is not empty, or a word of `form.missing` ends in a digit. None: all columns.
+        (how lines begin that are left out) is not empty, or a word of `form.missing` (words for a
+        missing number) ends in a digit. None: all columns.
 
     Returns
     -------
     Table
-        A line with a wrong number of cells is in its `damage`, and its row has empty cells. Empty
-        lines and those that `form.drop` names are left out, so that it may have no rows.
+        Its `damage` has an error for each line with a wrong number of cells, whose row has empty
+        cells. Empty lines and those that begin with a text of `form.drop` are left out, so that it
+        may have no rows.
 
     Raises
     ------
     UnreadableError
         If nothing but line ends stands where the samples begin, if the file has another encoding or
-        a zero byte, lacks a stated text of the header, or has neither header nor stated names, or
-        if all rows have a wrong number of cells.
+        a zero byte, has no line that begins with the text stated as `form.header`, or has neither
+        header nor stated names, or if all rows have a wrong number of cells.
     LookupError
         If Python does not know the encoding.
     """
@@ -143,15 +145,16 @@ def _header_line(content: bytes, header: str) -> int:
 
 
 def _names(top: Sequence[str], header: int, form: TextForm) -> list[str]:
-    """Return the names of the columns: those of `text.names`, otherwise the cells of the header.
+    """Return the names of the columns: those of `form.names`, otherwise the cells of the header.
 
-    A last name `x*` of `text.names` becomes `x0`, `x1`, ..., as many as the line `text.data` has
-    cells left, even if `text.drop` leaves this line out. In the header `#` or `%` at the beginning
-    is skipped, an empty cell is called by its number, like `column1`, and a name that repeats gets
-    a number, like `X.2`. Raises UnreadableError if there are neither names nor a header.
+    A last name `x*` of `form.names` becomes `x0`, `x1`, ..., as many as the first line of samples
+    has cells left, even if this line is left out of the table (`form.drop`). In the header `#` or
+    `%` at the beginning is skipped, an empty cell is called by its number, like `column1`, and a
+    name that repeats gets a number, like `X.2`. Raises UnreadableError if there are neither names
+    nor a header.
 
     top : the lines from the first to the first row of samples. header : the number of the header's
-    line, 0 for none. form : the section `[text]`.
+    line, 0 for none. form : how the file is written, the section `[text]` of a description.
     """
     names = [*form.names]
     if names and names[-1].endswith(REST):
@@ -172,9 +175,10 @@ def _read_plain(
     """Return the table with its columns, read by pandas; None if the file is not plain.
 
     A file is not plain if a row has a wrong number of cells, a line or a last cell is empty, a cell
-    has a line break, or `form.drop` is not empty, whatever lines it names. If a word of
-    `form.missing` ends in a digit, all columns have texts. A column of True and False has bools;
-    any other that pandas does not read as numbers has texts.
+    has a line break, or `form.drop` (how lines begin that are left out) is not empty, even if no
+    line begins so. If a word of `form.missing`, the words for a missing number, ends in a digit,
+    all columns have texts. A column of True and False has bools; any other that pandas does not
+    read as numbers has texts.
 
     table : has the names of the columns, which are empty, and the lines of the rows. words : the
     columns whose cells are read as texts; None: all.
@@ -220,15 +224,17 @@ def _read_strictly(content: bytes, table: Table, form: TextForm) -> Table:
 
     `content` is as `to_utf8` returns it. Of `table` the names of the columns and the first line
     number are read: reading begins at this line. Lines that begin with a text of `form.drop` are
-    dropped. If no line is left, the result has no rows. A line with a wrong number of cells is
-    added to `damage` of the result, and its row has empty cells. Raises UnreadableError if all
-    lines have a wrong number of cells.
+    dropped. If no line is left, the result has no rows. An error for each line with a wrong number
+    of cells is in `damage` of the result, and its row has empty cells. Raises UnreadableError if
+    all lines have a wrong number of cells.
     """
     n = len(table.columns)
     rows = dict[int, list[str]]()
     damage = list[UnreadableError]()
     lines = content.decode().split("\n")
-    while not lines[-1].strip(f" \t{form.delimiter}"):  # a spreadsheet's empty rows at the end
+    while lines and not lines[-1].strip(
+        f" \t{form.delimiter}"
+    ):  # a spreadsheet's empty rows at the end
         lines.pop()
     for i, line in enumerate(lines, 1):
         if i >= table.lines[0] and line.strip() and not line.startswith(form.drop):

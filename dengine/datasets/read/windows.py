@@ -21,20 +21,20 @@ Windows = Iterator[tuple[str, slice, str]]  # the key of a part, its rows, and w
 
 
 def cut(table: Table, description: Description, base: Path) -> Iterator[Table]:
-    """Yield the table of each part of a long recording, as `[windows]` says.
+    """Yield the table of each part of a long recording, as the section `[windows]` says.
 
-    A part is a window of rows, which a trigger begins, or whose start and end are in a listing, a
-    file in the folder `base`; with both stated the trigger counts. A trigger's window has
-    `traces.samples` rows, or fewer at the end of the recording, which is no damage. Windows of a
-    listing come by increasing start, and one without samples has one row. The `path` of a part's
-    table is the number of the part from 1, or its key in the listing. A part has `damage` if a
-    trigger begins it in a gap of the times, or if a window of the listing has no samples, overlaps
-    an earlier one, or goes beyond the recording. If the labels are a topic of a bag, that column
-    has at most one cell: the first label between the start of the part and the start of the next.
-    Raises DataError if `time.column` is not stated, if a trigger cuts and the rate is not stated,
-    if no part is found, if the recording has damage, or if times, signals, labels or the listing
-    cannot be read, SettingError for a malformed trigger, and LookupError for a listing in an
-    encoding that Python does not know.
+    A part is a window of rows, which a trigger, a condition on a signal, begins, or whose start and
+    end are in a listing, a file in the folder `base`; with both stated the trigger counts. A
+    trigger's window has `traces.samples` rows, or fewer at the end of the recording, which is no
+    damage. Windows of a listing come by increasing start, and one without samples has one row. The
+    `path` of a part's table is the number of the part from 1, or its key in the listing. A part has
+    `damage` (an error for which it is left out) if a trigger begins it in a gap of the times, or if
+    a window of the listing has no samples, overlaps an earlier one, or goes beyond the recording.
+    If the labels are a topic of a ROS bag, that column has at most one cell: the first label
+    between the start of the part and the start of the next. Raises DataError if `time.column` is
+    not stated, if a trigger cuts and the rate is not stated, if no part is found, if the recording
+    has damage, or if times, signals, labels or the listing cannot be read, SettingError for a
+    malformed trigger, and LookupError for a listing in an encoding that Python does not know.
     """
     import pandas as pd
 
@@ -65,10 +65,11 @@ def cut(table: Table, description: Description, base: Path) -> Iterator[Table]:
 def _triggered(table: Table, times: Floats, description: Description, base: Path) -> Windows:
     """Yield the number, the rows and the fault ("" for none) of each part that a trigger begins.
 
-    The numbers count from 1. Each part has `traces.samples` rows; those of the last may go beyond
-    the table, which is no fault here. It has a fault if it begins in a gap of the times, 1.5 steps
-    of the stated rate or more. A start within the previous part is ignored; a trigger that is on at
-    the first row, or was off for less than its `quiet_s`, is no start. `times`, shape (rows,), are
+    A trigger is a condition on a signal, and a fault says why a part is left out. The numbers count
+    from 1. Each part has `traces.samples` rows; those of the last may go beyond the table, which is
+    no fault here. A part has a fault if it begins in a gap of the times, 1.5 steps of the stated
+    rate or more. A start within the previous part is ignored; a trigger that is on at the first
+    row, or was off for fewer seconds than its `quiet_s`, is no start. `times`, shape (rows,), are
     in seconds and increase; `base` is not used. Raises DataError if the rate is not stated or a
     signal cannot be read, and SettingError for a malformed trigger.
     """
@@ -96,10 +97,10 @@ def _listed(table: Table, times: Floats, description: Description, base: Path) -
     window. `times`, shape (rows,), are the recording's, in seconds. If they begin at 1e8 s or
     later, like dates, and all ends in the listing are smaller, its times count from the first of
     `times`. The rows are those from the start to before the end (less 1e-5 s, for rounding). A
-    window has a fault if it overlaps an earlier one, has no samples, or goes beyond the recording
-    by more than 1.5 steps of the stated rate (without one: at all); one without samples gets the
-    first row. Raises DataError if the listing or its times cannot be read, and LookupError for an
-    encoding that Python does not know.
+    window has a fault (why it is left out) if it overlaps an earlier one, has no samples, or goes
+    beyond the recording by more than 1.5 steps of the stated rate (without one: at all); one
+    without samples gets the first row. Raises DataError if the listing or its times cannot be read,
+    and LookupError for an encoding that Python does not know.
     """
     about = description.windows
     bounds = []
