@@ -375,9 +375,9 @@ class Journal:
 
         The records that the store lacks are copied to the same offsets from the lost file, which is
         still open and is then closed. If another file is at the path by now, it is used: its header
-        and the bytes at these offsets are written over. Raise StoreError if it cannot be written,
-        or another engine has locked it, or the lost file cannot be read; the journal then still
-        uses the lost one.
+        and the bytes at these offsets are written over, and those behind them are cut off. Raise
+        StoreError if it cannot be written, or another engine has locked it, or the lost file cannot
+        be read; the journal then still uses the lost one.
         """
         lost = self._file
         self._file = _open_file(self.path)
@@ -386,6 +386,7 @@ class Journal:
                 self._file.write(
                     lost.read(self.end - self.drained_to, self.drained_to), self.drained_to
                 )
+                self._file.truncate(self.end)  # no records of another file behind ours
                 self._write_header_and_reserve()
         except StoreError:
             lost, self._file = self._file, lost

@@ -111,6 +111,19 @@ def test_a_journal_that_cannot_be_written_is_tried_again_and_says_why(box, monke
     assert box.fault == ""
 
 
+def test_a_journal_that_is_made_again_over_a_longer_file_keeps_no_record_of_it(tmp_path):
+    path, other = tmp_path / "cell.journal", tmp_path / "other.journal"
+    with closing(Journal(path)) as journal, closing(Journal(other)) as longer:
+        journal.append([b"a record"], 0.0)
+        longer.append([b"of another time"] * 9, 0.0)
+        path.unlink()
+        path.write_bytes(other.read_bytes())
+        journal.recreate()
+        with closing(Journal(path, owning=False)) as found:  # as after a crash
+            records = [record for _, _, record in found.undrained_records()]
+            assert (found.loss, records) == ("", [b"a record"])
+
+
 @pytest.fixture(params=["memory", "file"])
 def either(request, tmp_path):
     """An outbox of each kind."""
