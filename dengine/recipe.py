@@ -378,7 +378,8 @@ def _check_keys(table: Table, record_type: Any, where: str) -> None:
 def _read_text(path: Path) -> str | None:
     """Return the text of a recipe's file; None if there is no regular file at `path`.
 
-    Raises SettingError if the file is larger than 1 MB, is not UTF-8 or cannot be read.
+    A recipe holds all settings of an engine. Raises SettingError if the file is larger than 1 MB,
+    is not UTF-8 or cannot be read.
     """
     with (  # an OSError among them is a name that is too long
         instead(SettingError, f"Cannot read the recipe {str(path)[:200]}", OSError),

@@ -25,7 +25,7 @@ def check_description(description: Description) -> None:
     must be a channel, and all channels must have the same `limit`, the range of the sensor. If the
     `order` of the parts is "time", there must be a column of times. The settings in `[time]` and
     `[text]` must pass `check_forms`. Nothing else is checked: neither a trigger (the condition at
-    which a part begins) nor an expression, nor whether columns exist.
+    which a part begins) nor a regular expression, nor whether columns exist.
     """
     if open_keys := description.open_keys:
         raise DataError(f"Expected a description without ?, still open: {listed(open_keys)}.")

@@ -368,11 +368,11 @@ class Policy:
         )
 
     def action(self, lower: float, upper: float) -> Action:
-        """Return the action that a bound (lower, upper) allows, whatever the guarantee is.
+        """Return the action that bounds (lower, upper) of the success probability allow.
 
-        It is the paper's rule: ACCEPT if lower >= `lower_bound`, otherwise REJECT if upper <= 1 -
-        `lower_bound`, otherwise VERIFY, also for NaN. Neither the shadow mode (every part is
-        verified) nor force limits have an effect here.
+        It is ACCEPT if lower >= `lower_bound`, otherwise REJECT if upper <= 1 - `lower_bound`,
+        otherwise VERIFY, also for NaN. Which decision rule `guarantee` names, the shadow mode
+        (every part is verified) and force limits have no effect here.
         """
         from .rule import action_of
 

@@ -240,12 +240,12 @@ class Corrections:
 
         First a trained version is put in force or dropped, labels are stored, and what other cells
         of the product (robot cells that share labels and versions) stored is taken in; a training
-        under way in the executor is discarded, and begins again. This happens even if no version
-        was pinned. Then the same model goes on, stored as a new version. Labels that came while it
-        was pinned count for the next retrain, which may be due at once. If a version was pinned,
-        and a safe mode (after an alarm, parts are verified until new outcomes are good) began or
-        ended meanwhile, an event (a row in the store's log) is recorded, and `on_safe_mode`, the
-        user's function, is called.
+        under way in the executor is discarded, and begins again. If no version is pinned, nothing
+        more happens. Otherwise the same model goes on, stored as a new version. Labels that came
+        while it was pinned count for the next retrain, which may be due at once. If a safe mode
+        (after an alarm, parts are verified until new outcomes are good) began or ended meanwhile,
+        an event (a row in the store's log) is recorded, and `on_safe_mode`, the user's function, is
+        called.
 
         Parameters
         ----------

@@ -200,11 +200,12 @@ class Learner:
         """Train a version and put it in force, in this thread, or begin to in the executor.
 
         First every label is stored, since a version is trained only on labels that the store has
-        numbered. Then the call waits for what is computed in advance, and takes in what other cells
-        of the product (robot cells that share labels and versions) stored (a newer version, changes
-        of labels, and labels), since these may change what the training starts from. Then new
-        labels count from zero, and the training begins. Whether a rollback pinned the version in
-        force, so that no retrain should replace it, is not checked.
+        numbered. Then the call waits for what `precompute` computes in advance (above all features
+        of the traces), and takes in what other cells of the product (robot cells that share labels
+        and versions) stored (a newer version, changes of labels, and labels), since these may
+        change what the training starts from. Then new labels count from zero, and the training
+        begins. Whether a rollback pinned the version in force, so that no retrain should replace
+        it, is not checked.
 
         With `wait` True, or if no executor takes work (none is there, or it died or hangs), all is
         done in this thread, which then has one torch thread, and the report is returned. Otherwise

@@ -307,8 +307,8 @@ class Retrainer:
         counts from the start of the training. The current model is not changed. If the training
         fails, the outcome has no model, and nothing is raised; but what copying a user's model
         raises is raised. How long the training took for its last step and the work after it is
-        remembered: the longest of the newest 20 is reserved in the time budget of the next. This
-        thread then has one torch thread.
+        remembered: the longest of the newest 20 is reserved in the time budget of the next, but at
+        least 30 % and at most 70 % of it. This thread then has one torch thread.
         """
         trained = train_candidate(
             current.successor(),

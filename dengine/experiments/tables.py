@@ -70,9 +70,11 @@ def frame_of(replays: Sequence[Replay], check_seconds: float = VERIFY_SECONDS) -
 def pool(frame: pd.DataFrame, replays: Sequence[Replay]) -> list[Row]:
     """Pool the replays that have the same settings, and return a row for each of these settings.
 
-    The settings are the columns in `CONDITION`: recipe, interval, alpha, lower_bound, guarantee and
-    stops. There is a row for each combination of their values that the frame has, in the frame's
-    order.
+    The settings are the columns in `CONDITION`: recipe (name of the engine's settings, or of the
+    method that decides in its place) and, of the `Policy`, interval (method of the confidence
+    interval), alpha (its error level), lower_bound, guarantee (name of the decision rule) and stops
+    (whether all line stops are reported). There is a row for each combination of their values that
+    the frame has, in the frame's order.
 
     Parameters
     ----------

@@ -700,7 +700,8 @@ class ModelPrediction(EngineModel):
         decided (`lower`, `upper`), the label `success`, what the model alone would have done
         (`predicted`: 0 verify, 1 accept, 2 reject), and the probability, fixed beforehand, that the
         outcome would be asked for. The next decision is by the new state. If `observe` or `update`
-        raises, `rule_is_stale` becomes True and the exception is passed on.
+        raises, the exception is passed on, and `rule_is_stale` becomes True; later updates leave it
+        True.
         """
         was_stale = self.rule_is_stale
         self.rule_is_stale = True

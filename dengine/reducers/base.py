@@ -610,16 +610,16 @@ def check_classes(labels: Ints, masks: NDArray[np.bool_]) -> None:
 def draw_seed(random_state: Any) -> int:
     """Return a seed for NumPy and torch from scikit-learn's `random_state`.
 
-    An integer is the seed itself, and its range is not checked. A RandomState draws the seed, so it
-    gives another seed at each call; None stands for NumPy's global generator. Raises SettingError
-    for anything else.
+    An integer from 0 to 2**32 - 1 is the seed itself. A RandomState draws the seed, so it gives
+    another seed at each call; None stands for NumPy's global generator. Raises SettingError for
+    anything else.
     """
-    if isinstance(random_state, int | np.integer):
-        return int(random_state)
     with instead(
-        SettingError, "Expected random_state None, an integer or a RandomState", ValueError
+        SettingError, "Expected random_state None, an integer from 0 or a RandomState", ValueError
     ):
-        return int(check_random_state(random_state).randint(2**31 - 1))
+        drawn = check_random_state(random_state)
+    is_seed = isinstance(random_state, int | np.integer)
+    return int(random_state if is_seed else drawn.randint(2**31 - 1))
 
 
 def check_integers(reducer: Any, **ranges: tuple[int, int]) -> None:

@@ -85,8 +85,7 @@ class ProbabilityReducer(Reducer):
             outside a fold. `RocketReducer` also: if the traces outside a fold have a single class.
         TraceError, ValueError, TypeError
             If X is not of one of these shapes or sparse, a value is not finite, or all samples are
-            below 1e-12 but not all are 0 (`check_traces`). ValueError also for a negative
-            `random_state`.
+            below 1e-12 but not all are 0 (`check_traces`).
         """
         traces = self.check_traces(X, reset=True)
         labels = binary_labels(y, len(traces), type(self).__name__)

@@ -343,7 +343,7 @@ class RocketReducer(ProbabilityReducer):
         whose first coordinate is the probability by head ``folds[i]``. Raises the errors of
         `check_traces`, and SettingError for fewer than 20 traces, if the traces outside a fold have
         a single class, and at the first call also for a parameter out of its range, fewer than 2
-        samples or a `random_state` of another type, and ValueError for a negative one.
+        samples or a `random_state` that gives no seed.
         """
         expect(
             len(X) >= MIN_TRACES, f"at least {MIN_TRACES} traces", len(X), "verify more parts first"
@@ -360,8 +360,7 @@ class RocketReducer(ProbabilityReducer):
         the standard deviation 1 in at most 256 of the traces; one that never moves is only shifted.
         The weights of the classifier heads (logistic regressions on the kernels' features) are 0.
         Earlier fits are discarded, and `is_initialized_` becomes True. Raises SettingError for a
-        parameter out of its range, fewer than 2 samples or a `random_state` of another type, and
-        ValueError for a negative one.
+        parameter out of its range, fewer than 2 samples or a `random_state` that gives no seed.
         """
         x = torch.from_numpy(traces)
         self.build(traces.shape[1], traces.shape[2], averaging(x))

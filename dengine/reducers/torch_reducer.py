@@ -220,7 +220,7 @@ class TorchReducer(ProbabilityReducer):
         The points are float32 (n, d), row i in embedding space ``folds[i]``, the one of copy
         ``folds[i]``. Raises the errors of `check_traces`, and SettingError for fewer than two
         traces outside a fold, and at the first training for fewer than 20 traces, or a parameter,
-        network or checkpoint that cannot be used. Raises ValueError for a negative `random_state`.
+        network, checkpoint or `random_state` that cannot be used.
         """
         traces = self._check_and_initialize(X)
         return self._train(

@@ -271,8 +271,7 @@ class UmapReducer(Reducer):
             `n_neighbors` or `n_components` traces or fewer.
         TraceError, ValueError, TypeError
             If X is not of one of these shapes or sparse, a value is not finite, or all samples are
-            below 1e-12 but not all are 0 (`check_traces`). ValueError also for a negative
-            `random_state`.
+            below 1e-12 but not all are 0 (`check_traces`).
         """
         traces = self._check(X, reset=True)
         self._initialize(traces)
@@ -301,8 +300,8 @@ class UmapReducer(Reducer):
         both) ends them; after its deadline at most ten more are taken. What `precompute` found is
         used, unless seed and frames are new, and then dropped. The points are float32 (n,
         n_components) and share their memory with `embedding_`. Raises the errors of `check_traces`,
-        SettingError for a parameter out of its range, a `random_state` of another type or too few
-        traces, and ValueError for a negative `random_state`.
+        and SettingError for a parameter out of its range, a `random_state` that gives no seed, or too
+        few traces.
         """
         traces = self._check(X, reset=not self._is_fitted)
         if numbers is None or not self._has_searched_any(numbers):

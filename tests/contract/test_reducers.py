@@ -90,6 +90,12 @@ def test_too_little_to_learn_from_is_a_setting_error(name):
         ModelPrediction(new(name)).fit(X, np.ones(2))
 
 
+@pytest.mark.parametrize("name", ["conv", "rocket", "umap"])
+def test_a_negative_seed_is_a_setting_error(name):
+    with pytest.raises(SettingError, match="random_state"):
+        make_reducer(name, random_state=-1).fit(*toy_traces())
+
+
 @every_reducer
 def test_an_unknown_setting_is_an_error_that_lists_the_known(name):
     with pytest.raises(SettingError, match=r"no parameter dimm; it has .*random_state"):

@@ -67,7 +67,8 @@ def push(conditions: Conditions, time_step_s: float = TIME_STEP_S) -> Push:
     -------
     Push
         The force, 1000 samples in newtons, the height of the part's top above its nominal seated
-        height, and how far the part slid up in the gripper, in mm.
+        height, and how far the part slid up in the gripper, in mm; -40 and 0 if the grasp missed
+        the part.
 
     Raises
     ------

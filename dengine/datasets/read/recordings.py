@@ -301,9 +301,10 @@ def parts_of(file: str | Table, description: Description, base: Path) -> Iterato
 def is_dropped(part: Table, rows: Mapping[str, RowWords]) -> bool:
     """Return whether a column in `rows` has a single cell for a part, with a word to drop.
 
-    `rows` says by column what words keep or drop a row. The whole part is left out then, for
+    `part` has the samples of one workpiece, or a long recording of several. `rows` says by column
+    what words keep or drop a row; `*` is any other word. The whole part is left out then, for
     example a row with the samples of another signal, in a table with a row for each part. A column
-    that the part lacks, or a word without a stated meaning, drops nothing.
+    that the part lacks, or a word without a meaning, drops nothing.
     """
     for name in rows.keys() & part.columns.keys():
         cells = part.columns[name]
