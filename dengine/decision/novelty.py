@@ -135,16 +135,17 @@ class NoveltyGate(nn.Module):
         return nearest + (z * z).sum(1)
 
     def plain_features(self, x: Tensor) -> Tensor:
-        """Return the features of traces (..., C, T) that are not distortions, (..., P) float32.
+        """Return all features of traces (..., C, T) but the distortions: (..., P) float32.
 
-        P is C * (4*S + 3). A channel is cut into S segments, stretches of equal length that
-        together cover the trace, and may overlap. For each channel the features are the S minima
-        and the S maxima of the segments, then 2*S + 3 logarithms of roughness, which is the norm of
-        the differences of successive samples in a stretch, plus `noise_floor`. The first S are of
-        first differences in the segments, the next S of second differences in the segments. The
-        last three, for gaps, are of first differences in brief stretches. Such a stretch has T /
-        100 differences, rounded down, and at least one. These three are the least roughness over
-        stretches of twice that length, then the least and the largest over stretches of that
+        The distortions, features of what a faulty sensor or clock would do, are computed from these
+        by `scores`. P is C * (4*S + 3). A channel is cut into S segments, stretches of equal length
+        that together cover the trace, and may overlap. For each channel the features are the S
+        minima and the S maxima of the segments, then 2*S + 3 logarithms of roughness, which is the
+        norm of the differences of successive samples in a stretch, plus `noise_floor`. The first S
+        are of first differences in the segments, the next S of second differences in the segments.
+        The last three, for gaps, are of first differences in brief stretches. Such a stretch has
+        T / 100 differences, rounded down, and at least one. These three are the least roughness
+        over stretches of twice that length, then the least and the largest over stretches of that
         length.
         """
         pieces = x.unfold(-1, self.length, self.stride)  # (..., C, S, L)

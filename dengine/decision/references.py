@@ -422,8 +422,9 @@ class RadiusIndex(nn.Module):
     def estimate_agreement(self) -> None:
         """Set `agreement`, how strongly labels of one part agree, for all counts from now on.
 
-        It is computed from the points in the index (`label_agreement`). Nothing changes if no part
-        has several points in it.
+        When the labels near a trace are counted, m labels of one part are worth m / (1 + (m - 1) *
+        `agreement`) votes. It is computed from the points in the index (`label_agreement`). Nothing
+        changes if no part has several points in it.
         """
         if int(self.repeats) > 0:
             self.agreement.fill_(

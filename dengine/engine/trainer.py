@@ -302,13 +302,14 @@ class Retrainer:
         """Train a successor of the current model in this thread, and return the outcome.
 
         The model decides whether a successor starts from the weights of the current model or from
-        scratch. It is trained on the training window as it is now. `begin` is when work on the
-        retrain began, in seconds by the clock. It is only put in the outcome; the time budget
-        counts from the start of the training. The current model is not changed. If the training
-        fails, the outcome has no model, and nothing is raised; but what copying a user's model
-        raises is raised. How long the training took for its last step and the work after it is
-        remembered: the longest of the newest 20 is reserved in the time budget of the next, but at
-        least 30 % and at most 70 % of it. This thread then has one torch thread.
+        scratch. It is trained on the training window as it is now. The time budget, or `max_steps`
+        optimiser steps, may end the training early; it is accepted all the same. `begin` is when
+        work on the retrain began, in seconds by the clock. It is only put in the outcome; the time
+        budget counts from the start of the training. The current model is not changed. If the
+        training fails, the outcome has no model, and nothing is raised; but what copying a user's
+        model raises is raised. How long the training took for its last step and the work after it
+        is remembered: the longest of the newest 20 is reserved in the time budget of the next, but
+        at least 30 % and at most 70 % of it. This thread then has one torch thread.
         """
         trained = train_candidate(
             current.successor(),

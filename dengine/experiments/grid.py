@@ -345,8 +345,9 @@ def iterate_replays(
 def _play(data: Dataset, i: int, task: Task, on_cycle: Any) -> tuple[int, Replay]:
     """Play one task, a replay of the data set to be played, in this process or a joblib worker.
 
-    Returns `i`, the position of the task among all tasks, and the replay. `on_cycle` is called with
-    the number of finished cycles after each; None: nothing is called. Raises what `replay` raises.
+    Returns `i`, the position of the task among all tasks, and the replay. `on_cycle` is called
+    after each cycle (one part) with the number of finished ones; None: nothing is called. Raises
+    what `replay` raises.
     """
     return i, replay(
         data,

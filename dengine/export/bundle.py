@@ -186,14 +186,15 @@ def exportable(engine_or_model: Any, trace: TraceSpec | None = None) -> Exportab
     """Return the model that decides at present, with the engine's settings, for an exporter.
 
     `engine_or_model` is a `DataEngine` or a `ModelPrediction`. Of an engine the result has the rate
-    of audits (checks of parts that the model is certain of), the seed of their draw, the operator's
-    force limits, the version, the recipe (all settings), up to eight labelled traces, and a
-    function that records events; of a model alone, which has none of these, it has some of the
-    traces it was trained on. The model is not copied, and goes on learning. `trace` replaces the
-    `TraceSpec` (shape, rate and units of the traces) of the engine or the model. Raises ExportError
-    before the first training, for a baseline (a model that the user handed in), and if the engine's
-    store was changed from outside; StoreError if it cannot be read. A damaged trace is left out,
-    and noted as an event in the store.
+    of audits (checks of parts that the model is certain of), the seed of their draw, whether an
+    accepted part counts as good if nothing is reported until the next decision (`stops_all`), the
+    operator's force limits, the version, the recipe (all settings), up to eight labelled traces,
+    and a function that records events; of a model alone, which has none of these, it has some of
+    the traces it was trained on. The model is not copied, and goes on learning. `trace` replaces
+    the `TraceSpec` (shape, rate and units of the traces) of the engine or the model. Raises
+    ExportError before the first training, for a baseline (a model that the user handed in), and if
+    the engine's store was changed from outside; StoreError if it cannot be read. A damaged trace is
+    left out, and noted as an event in the store.
     """
     engine = engine_or_model if isinstance(engine_or_model, DataEngine) else None
     model = engine_or_model if engine is None else engine.model

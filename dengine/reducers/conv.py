@@ -226,7 +226,7 @@ class ConvReducer(TorchReducer):
         initial weights; it resets the counts of steps and the optimiser, and sets `is_initialized_`
         to False. `average` is the number of samples that are averaged to one. Without `seed` the
         seed of the networks comes from `random_state`. Raises SettingError for a parameter out of
-        its range, fewer than 2 samples, or a `random_state` of another type; `rocket_` has been
+        its range, fewer than 2 samples, or a `random_state` that gives no seed; `rocket_` has been
         replaced by then.
         """
         # Before `encoder_`, by which other threads see that there is a module.

@@ -267,7 +267,7 @@ class UmapReducer(Reducer):
         Raises
         ------
         SettingError
-            If a parameter is out of its range, `random_state` is of another type, or there are
+            If a parameter is out of its range, `random_state` gives no seed, or there are
             `n_neighbors` or `n_components` traces or fewer.
         TraceError, ValueError, TypeError
             If X is not of one of these shapes or sparse, a value is not finite, or all samples are
@@ -300,8 +300,8 @@ class UmapReducer(Reducer):
         both) ends them; after its deadline at most ten more are taken. What `precompute` found is
         used, unless seed and frames are new, and then dropped. The points are float32 (n,
         n_components) and share their memory with `embedding_`. Raises the errors of `check_traces`,
-        and SettingError for a parameter out of its range, a `random_state` that gives no seed, or too
-        few traces.
+        and SettingError for a parameter out of its range, a `random_state` that gives no seed, or
+        too few traces.
         """
         traces = self._check(X, reset=not self._is_fitted)
         if numbers is None or not self._has_searched_any(numbers):
@@ -332,7 +332,7 @@ class UmapReducer(Reducer):
         nothing is done. Before the first training each call also sets the shape, draws the seed and
         sets up new frames, the sums of samples between which distances are measured. Raises the
         errors of `check_traces`, and SettingError for a parameter out of its range, a
-        `random_state` of another type, or too few traces.
+        `random_state` that gives no seed, or too few traces.
         """
         if numbers is None:
             return
@@ -367,7 +367,7 @@ class UmapReducer(Reducer):
         a short stretch of samples. The number of frames of a trace and their centre and scale come
         from at most 256 of the traces, evenly spaced. An earlier `encoder_`, the module that
         embeds, stays until the next training replaces it. Raises SettingError for a `random_state`
-        of another type.
+        that gives no seed (another type, a negative number or one above 2**32 - 1).
         """
         sample = traces[:: 1 + len(traces) // CHUNK]
         self.make_frames_ = frames_for(sample)

@@ -164,7 +164,7 @@ class DecisionTable(CellTable):
         ]
 
     def pending(self, since_version: int = 0) -> list[StoredDecision]:
-        """Return the cell's decisions with action VERIFY that have no label, oldest first.
+        """Return the robot cell's decisions with action VERIFY that have no label, oldest first.
 
         Accepted decisions are not among them, see `unreported_accepts`.
 

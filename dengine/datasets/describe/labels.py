@@ -243,11 +243,12 @@ def count_sources(p: Proposal, stated: Sequence[LabelSource]) -> dict[LabelSourc
     have few different words (`may_be_labels`), and a word for more than half of the recordings. A
     source with the same words as an earlier one counts only if it is named like a verdict
     (`is_named_like_verdict`). For listings and paths all recordings count, since their names are
-    enough; for columns and lines only those whose tables were read. The words are sorted into good,
-    bad and unchecked as `with_meanings` does; but in the layout `npz`, an archive of all parts, 1
-    is good and 0 is bad in an array y of 1 and 0, unless `label.good` is stated. Raises DataError
-    if the stated source has no words or cannot be read, or, if none is stated, if cells of a column
-    without another use are lists; and SettingError for a malformed `windows.trigger`.
+    enough; for columns and lines only those whose tables were looked at (`p.tables`). The words are
+    sorted into good, bad and unchecked as `with_meanings` does; but in the layout `npz`, an archive
+    of all parts, 1 is good and 0 is bad in an array y of 1 and 0, unless `label.good` or
+    `label.bad` is stated. Raises DataError if the stated source has no words or cannot be read, or,
+    if none is stated, if cells of a column without another use are lists; and SettingError for a
+    malformed `windows.trigger`, the condition at which long recordings are cut.
 
     stated : the source that the user stated, `[label]`; empty if there is none.
     """
