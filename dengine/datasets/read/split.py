@@ -115,10 +115,11 @@ def split(table: Table, description: Description) -> Iterator[Table]:
 def longest_list(table: Table) -> int:
     """Return the most items of a list or array among the first cells of the columns.
 
-    0 if none of these cells is a list.
+    Of a list of lists all items count. 0 if none of these cells is a list with items.
     """
     cells = [column[0] for column in table.columns.values() if len(column)]
-    return max((len(cell) for cell in cells if isinstance(cell, frames.ITEMS)), default=0)
+    lists = [cell for cell in cells if isinstance(cell, frames.ITEMS) and len(cell)]
+    return max((len(cell) * np.size(cell[0]) for cell in lists), default=0)
 
 
 def _split_rows(table: Table, description: Description) -> Iterator[Table]:
