@@ -249,7 +249,8 @@ def output_file(
     path : path
         File that is to be there at the end.
     force : bool, default False
-        Whether a file that exists may be replaced; see `check_output`.
+        Whether a file that exists may be replaced. A database, folder, link, pipe or device never
+        is; see `check_output`.
     make_folder : bool, default False
         Whether the folder of `path` is made, with its parents, if it does not exist. The folder
         stays even if the block raises.

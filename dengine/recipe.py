@@ -220,9 +220,10 @@ class Recipe:
         ----------
         recipe : str, path, Recipe or estimator
             A name in `RECIPES`, the recipes of dengine; the path of a TOML file; a Recipe, which is
-            returned unchanged; or a reducer of your own, which gets the default settings:
-            `module:Class`, which is not imported here, or a scikit-learn transformer. A text or
-            path is first taken as a name, then as a path, then as `module:Class`.
+            returned unchanged; or a reducer (a transformer from traces to points) of your own,
+            which gets the default settings: `module:Class`, which is not imported here, or a
+            scikit-learn transformer. A text or path is first taken as a name, then as a path, then
+            as `module:Class`.
 
         Raises
         ------
@@ -347,11 +348,11 @@ class Recipe:
         """Return the reducer: the object itself if one was given, or a new one, made by name.
 
         The class of a named reducer is imported. If it has a parameter `random_state` or `folds`,
-        that gets the seed or the recipe's `folds`; the recipe's `params` take precedence. Raises
-        SettingError if the class cannot be imported, whatever `Exception` its module raises, or is
-        no scikit-learn transformer, if it lacks one of these `params`, or if the value of one, or
-        the seed, does not fit a reducer of dengine; what the constructor of a user's class raises
-        passes unchanged.
+        that gets the seed or the recipe's `folds` (the number of groups for cross-fitting); the
+        recipe's `params` take precedence. Raises SettingError if the class cannot be imported,
+        whatever `Exception` its module raises, or is no scikit-learn transformer, if it lacks one
+        of these `params`, or if the value of one, or the seed, does not fit a reducer of dengine;
+        what the constructor of a user's class raises passes unchanged.
         """
         if not isinstance(self.reducer, str):
             return self.reducer

@@ -200,8 +200,8 @@ def _drive(
 def _safe_mode_line(change: Record) -> str:
     """Return a sentence: after which cycle safe mode began, and why, or that it ended.
 
-    In safe mode, after an alarm, every part is verified. `change` has the number of the cycle,
-    `cycle`, and the `reason`, "" if safe mode ended.
+    In safe mode, after an alarm, every part is verified. `change` has `cycle`, the number of the
+    cycle (the work on one part), and the `reason`, "" if safe mode ended.
     """
     event = "safe mode ended"
     if change["reason"]:

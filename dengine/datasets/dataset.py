@@ -150,10 +150,11 @@ class Dataset:
     def spec(self) -> TraceSpec:
         """The `TraceSpec` of live traces of the same shape, for `DataEngine(trace=data.spec)`.
 
-        It has the shape, rate, unit and limit of the traces, and as `columns` the names of the
-        channels. Live traces are those that a robot cell records now. A rate or a unit that is
-        unknown is None. Raises SettingError if a field of the data set has a value that no trace
-        can have, for example if two channels have the same name.
+        It has the shape, rate and unit of the traces, `limit` (the range of the sensor), `fit`
+        (what is done with traces of another length), and as `columns` the names of the channels.
+        Live traces are those that a robot cell records now. A rate or a unit that is unknown is
+        None. Raises SettingError if a field of the data set has a value that no trace can have, for
+        example if two channels have the same name.
         """
         _, channels, samples = self.cube.shape
         return TraceSpec(

@@ -543,11 +543,12 @@ def _made(kind: Any, value: Any, where: str) -> Any:
 def _as_kind(kind: Any, value: Any, where: str) -> Any:
     """Return a value of a TOML file in the type of its key, `kind`; `?` is returned as it is.
 
-    `kind` is a type in `KINDS`: text, whole number, number, boolean, or whole number or text. A
-    number or boolean becomes a text, as Python writes it (`True`, `nan`), if only a text is
-    expected, and a whole number becomes a float if a number is expected. Raises DataError for a
-    value of another type; and, if a number is expected, for one that is not finite or too large for
-    a float. `where` is the name of the key in the message.
+    The text `?` stands for a value that the user must still state. `kind` is a type in `KINDS`:
+    text, whole number, number, boolean, or whole number or text. A number or boolean becomes a
+    text, as Python writes it (`True`, `nan`), if only a text is expected, and a whole number
+    becomes a float if a number is expected. Raises DataError for a value of another type; and, if a
+    number is expected, for one that is not finite or too large for a float. `where` is the name of
+    the key in the message.
     """
     if value == UNKNOWN:
         return value

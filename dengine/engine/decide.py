@@ -344,12 +344,12 @@ def check_same_trace(stored: StoredDecision, trace: Any, spec: TraceSpec | None)
 
 
 def verify_decision(decision_id: str, part: str | None, version: int, reason: Reason) -> Decision:
-    """Return a VERIFY decision for which neither model nor trace was looked at.
+    """Return a decision to check the part (VERIFY); neither model nor trace was looked at.
 
-    `part` is the part's number, and `version` that of the model. It counts no labels, and has the
-    bounds 0 and 1, no embedding, and 1 as its `propensity`, the probability of a check. What the
-    model would have done, `predicted`, is VERIFY, too; so it is no audit (a check of a part that
-    the model would accept or reject). Nothing is recorded.
+    `part` is the part's number, and `version` that of the model. The decision counts no labels, and
+    has the bounds 0 and 1 of the success probability, no embedding, and 1 as its `propensity`, the
+    probability of a check. What the model would have done, `predicted`, is VERIFY, too; so it is no
+    audit (a check of a part that the model would accept or reject). Nothing is recorded.
     """
     return Decision(
         id=decision_id,

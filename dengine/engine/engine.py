@@ -261,19 +261,22 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         weakref.finalize(self, _close_forgotten, self._outbox)
 
     def _resume(self) -> None:
-        """Restore what the store holds: version, references, rule, labels and pending checks.
+        """Restore what the store holds: version, references, rule, labels and awaited outcomes.
 
-        The engine then decides bit for bit as before it was closed, with two exceptions: if the
-        newest version is damaged, the newest intact one decides, and if the store differs from its
-        ledger (its hash chain), every part is verified. A damaged version or trace is reported by
-        an event (a row in the store's log). A new cell of a product (robot cells that share labels
-        and versions) decides by the product's newest version. A model of which the store has only
-        the numbers of its traces is trained on them again; if one of these is damaged or missing,
-        no model is in force. A thread may be started that computes in advance for the next retrain.
-        This method is called once, before the first decision, and waits for the store without a
-        time limit. If retrains run in the calling thread, it also waits until the first retrain can
-        begin without delay. Raises the errors of `LiveModel.resume` and `Feedback.resume`;
-        StoreError if the store cannot be read is one of them.
+        References are labelled points that new traces are compared with, and the rule turns the
+        bounds of a success probability into an action. The awaited outcomes are those of checked
+        and accepted parts. The engine then decides bit for bit as before it was closed, with two
+        exceptions: if the newest version is damaged, the newest intact one decides, and if the
+        store differs from its ledger (its hash chain), every part is verified. A damaged version or
+        trace is reported by an event (a row in the store's log). A new cell of a product (robot
+        cells that share labels and versions) decides by the product's newest version. A model of
+        which the store has only the numbers of its traces is trained on them again; if one of these
+        is damaged or missing, no model is in force. A thread may be started that computes in
+        advance for the next retrain. This method is called once, before the first decision, and
+        waits for the store without a time limit. If retrains run in the calling thread, it also
+        waits until the first retrain can begin without delay. Raises the errors of
+        `LiveModel.resume` and `Feedback.resume`; StoreError if the store cannot be read is one of
+        them.
         """
         settings = self._settings.now
         self._learner.resume(settings.recipe.policy.label_within, settings.policy_since)
@@ -590,14 +593,15 @@ class DataEngine(AbstractContextManager["DataEngine"]):
 
         These are the steps. The trace is converted, so that a wrong trace raises before it could
         confirm an earlier part. If the decision rule, which learns from outcomes, was updated with
-        a wrong one, it is put right. Accepted parts that nobody reported are confirmed as good
-        (with `stops="all"`, under which every bad one is reported in time) or counted, which may
-        change the rule. The decision is made and recorded; without a `decision_id` it gets a new
-        id. With a `decision_id` the call waits until the decision is on disk; if the disk does not
-        take it in time, an ACCEPT or REJECT becomes VERIFY. The decision is then noted as a check
-        or an outcome that is waited for, and checks without a report for too long
-        (`Policy.label_within`) count as wrong decisions, which may change the rule, too. Raises
-        what `DecisionMaker.convert` raises, before anything else is done.
+        a wrong one, it is put right; a model that cannot change a label is retrained for that
+        (`Learner.catch_up`). Accepted parts that nobody reported are confirmed as good (with
+        `stops="all"`, under which every bad one is reported in time) or counted, which may change
+        the rule. The decision is made and recorded; without a `decision_id` it gets a new id. With
+        a `decision_id` the call waits until the decision is on disk; if the disk does not take it
+        in time, an ACCEPT or REJECT becomes VERIFY. The decision is then noted as a check or an
+        outcome that is waited for, and checks without a report for too long (`Policy.label_within`)
+        count as wrong decisions, which may change the rule, too. Raises what
+        `DecisionMaker.convert` raises, before anything else is done.
         """
         x = self._maker.convert(trace)
         self._learner.catch_up()

@@ -349,11 +349,12 @@ class Feedback:
         In a safe mode, which begins after an alarm of the decision rule, parts are verified until
         new outcomes are good. An event (a row in the store's log) is recorded, then the user's
         function `on_safe_mode` is called. It gets the reason of a safe mode that began, or "" if it
-        ended; then the event says `reason_ended`. If another alarm changes the reason of a safe
-        mode, it is announced once more, as one that began. What changed and changed back between
-        two calls is not announced. If the event cannot be recorded, the user's function is not
-        called. This, like an exception of the function, is logged, and nothing is tried again.
-        Callers do this only after labels are stored, so that such a failure costs no label.
+        ended; then the event says `reason_ended` (in its default, the tolerance is the share of
+        wrong decisions that the policy allows). If another alarm changes the reason of a safe mode,
+        it is announced once more, as one that began. What changed and changed back between two
+        calls is not announced. If the event cannot be recorded, the user's function is not called.
+        This, like an exception of the function, is logged, and nothing is tried again. Callers do
+        this only after labels are stored, so that such a failure costs no label.
         """
         safe_mode = self._live.newest.safe_mode
         if safe_mode == self._safe_mode:

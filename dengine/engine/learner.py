@@ -676,11 +676,12 @@ class Learner:
     def _precompute_other_start(self) -> None:
         """Begin to precompute for the next training if it does not start from the model in force.
 
-        This can be so after a label was forgotten (withdrawn): the training then starts from an
-        earlier version or from initial weights. A thread computes what that model needs of the
-        traces in the training window (the newest labelled traces), and keeps it in that model; a
-        failure is logged. Without labels, and while an earlier thread still works, nothing is
-        begun. Without an executor the retrain would wait for the thread, and its report would count
+        The model in force is the one that decides now. After a label was forgotten (withdrawn), the
+        training may start from an earlier version or from initial weights instead. A thread
+        computes what that model needs of the traces in the training window (the newest labelled
+        traces), and keeps it in that model; a failure is logged. Without labels, and while an
+        earlier thread still works, nothing is begun. Without an executor (a pool in which retrains
+        run beside the engine) the retrain would wait for the thread, and its report would count
         these seconds; so this call waits for the thread, also for an earlier one.
         """
         if self._choose_start() is self.live.newest:

@@ -127,12 +127,12 @@ class LiveModel:
         present rule, which a change of the policy began.
 
         The outcomes that update the rule, and the labels of a repeated training, are checked
-        against the store's ledger (its hash chain). A difference sets `outbox.integrity_error`,
-        after which every part is verified. A damaged trace is noted as an event in the store's log.
-        An exception as the model is made ready, or as the rule or the references learn, is logged;
-        after an exception of the rule every part is verified, too. The attributes `overdue` and
-        `overdue_to` (which checks are overdue) and `corrected_to` (the newest correction that was
-        applied) are restored.
+        against the store's ledger (its hash chain). A difference sets `integrity_error` of the
+        outbox, which records decisions and labels; after that every part is verified. A damaged
+        trace is noted as an event in the store's log. An exception as the model is made ready, or
+        as the rule or the references learn, is logged; after an exception of the rule every part is
+        verified, too. The attributes `overdue` and `overdue_to` (which checks are overdue) and
+        `corrected_to` (the newest correction that was applied) are restored.
 
         Parameters
         ----------

@@ -281,14 +281,15 @@ def _with_objects(
 ) -> Recipe:
     """Return a stored recipe, with the reducer object put into it if the recipe cannot name it.
 
-    A recipe has the settings of model, policy and retrains. It cannot name a reducer that TOML does
-    not describe, like a pipeline, nor a `model` of the user, which decides by its own rule: the
-    user must hand in such an object each time. `texts` are the store's settings, and `name` is the
-    name of the store for messages. If the store's engine has a `model` of the user, any `reducer`
-    is accepted, and the recipe is returned as it is. So is a recipe that names its reducer. With
-    such a recipe `reducer` may be None, a name, which is not compared here, or an object of the
-    class (`module:Class`) and with the parameters that the recipe names; if the recipe has a short
-    name like "conv", no object is accepted.
+    A recipe has the settings of model, policy and retrains. It cannot name a reducer (a transformer
+    from traces to points) that TOML does not describe, like a pipeline, nor a `model` of the user,
+    which decides by its own rule: the user must hand in such an object each time. `texts` are the
+    store's settings, and `name` is the name of the store for messages. If the store's engine has a
+    `model` of the user, any `reducer` is accepted, and the recipe is returned as it is. So is a
+    recipe that names its reducer. With such a recipe `reducer` may be None, a name, which is not
+    compared here, or an object, if the recipe has its class (`module:Class`, by the module that
+    defines it) and exactly those of its parameters that are not None, defaults included. If the
+    recipe has a short name like "conv", no object is accepted.
 
     Raises SettingError for another object as `reducer`; if an object that must be handed in is
     missing, or differs from the one that the store was made with (a reducer in its class and
@@ -449,8 +450,8 @@ def check_model_settings(reducer: Any, given: Settings) -> None:
     A model that the user hands in decides by its own rule. `reducer` is the setting of that name,
     and `given` holds the other settings by name; None is a setting that was not given. Reducer,
     radius and folds have no effect and must not be given. In `given["policy"]` only the fields in
-    `BASELINE_SETTINGS` have an effect (audit_rate, stops, label_within, force_limits and shadow);
-    any other field must be at its default. Settings of other names pass.
+    `BASELINE_SETTINGS` have an effect (audit_rate, stops, label_within, force_limits and shadow;
+    `Policy` explains them); any other field must be at its default. Settings of other names pass.
     """
     idle = [name for name in ("radius", "folds") if given.get(name) is not None]
     if reducer is not None:

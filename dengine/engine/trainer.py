@@ -186,9 +186,9 @@ class TrainedOn:
     def from_state(cls, state: Mapping[str, NDArray[Any]]) -> Self:
         """Return the record that `to_state` turned into arrays.
 
-        Without "pinned" this attribute is 0: no rollback has put the version in force again. Arrays
-        of other names are ignored. Raises KeyError without "trained_on", "trained_as" or
-        "counts_from".
+        Without "pinned" this attribute is 0: the version (a trained model) is not one that a
+        rollback put in use again. Arrays of other names are ignored. Raises KeyError without
+        "trained_on", "trained_as" or "counts_from".
         """
         return cls(
             state["trained_on"],

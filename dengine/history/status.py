@@ -368,9 +368,9 @@ def status(store: SqlStore, last: int = NEWEST, watching: bool = False) -> Statu
     last : int, default 500
         Number of newest decisions that `Status.newest` counts.
     watching : bool, default False
-        Whether `Status.watch` is computed, too: how close each detector of drift is to an alarm.
-        Without detectors (guarantee "local" with stops="some") it is None, and no arrays are read
-        for it.
+        Whether `Status.watch` is computed, too: how close each detector of drift is to an alarm. It
+        is None without detectors. The guarantee (the rule that decides) "local" has none with
+        stops="some" (bad accepted parts may go unreported); no arrays are read for it then.
 
     Returns
     -------

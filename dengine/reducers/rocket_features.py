@@ -161,11 +161,11 @@ class RocketEncoder(nn.Module):
         """Compute unscaled features (B, P) of raw traces (B, C, T): of tower 1, then of tower 2.
 
         A tower is a group of features from convolution kernels. The features of tower 1 are from 0
-        to 3: the mean over a region, plus twice the mean over the whole trace, of a kernel's
-        outputs, which are limited to 0 to 1 (`ramp_features`). In tower 2 kernels compete in groups
-        of 8; its features say how often each kernel of a group has the largest, and how often the
-        smallest output (`competition_features`). If `groups` is 0, there is no tower 2.
-        `scale_features` standardises the features.
+        to 3: the mean over a region, a stretch of the trace, plus twice the mean over the whole
+        trace, of a kernel's outputs, which are limited to 0 to 1 (`ramp_features`). In tower 2
+        kernels compete in groups of 8; its features say how often each kernel of a group has the
+        largest, and how often the smallest output (`competition_features`). If `groups` is 0, there
+        is no tower 2. `scale_features` standardises the features.
         """
         values = self.read_taps(self.average_samples(x))
         n_dense = self.n_dense_taps

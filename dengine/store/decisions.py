@@ -351,8 +351,8 @@ class DecisionTable(CellTable):
         Parameters
         ----------
         tally : Tally or None
-            What the method `tally` returned over all decisions, if it was called already; None: it
-            is called here.
+            All decisions, counted in groups: what the method `tally` returned, if it was called
+            already; None: it is called here.
 
         Returns
         -------
@@ -362,7 +362,8 @@ class DecisionTable(CellTable):
             corrected: number of decisions whose label was ever corrected or forgotten, and is not
             forgotten now; forgotten: number of those whose label is forgotten now; actions,
             reasons: numbers of decisions for each action and reason; sources: numbers of labels for
-            each source, without forgotten ones. These three are dicts that include values with 0.
+            each source, like a check or a line stop, without forgotten ones. These three are dicts
+            that include values with 0.
         """
         tally = tally or self.tally()
         actions = tally.by("action")

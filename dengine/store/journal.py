@@ -551,6 +551,8 @@ def _open_file(path: Path, owning: bool = True) -> OwnedFile:
 def journal_path(url: Any, cell_id: str) -> Path:
     """Return the path of a cell's journal, whether the file exists or not.
 
+    The journal is the local file that gets each record of a robot cell first.
+
     Parameters
     ----------
     url : sqlalchemy.URL

@@ -156,7 +156,7 @@ class LabelTable(CellTable):
         `query` must have this limit (None: no limit), order and condition already. It is run on all
         labels, and its rows are fetched while the caller goes through them, which the caller must
         do within the transaction of `connection`. In a product (robot cells that share labels and
-        versions) a query with a limit is first run on the labels with the 2 * `limit` highest
+        trained models) a query with a limit is first run on the labels with the 2 * `limit` highest
         numbers up to `last`, because the database would sort all labels of the product otherwise.
         If these give `limit` rows, or if there are no labels before them, their rows are returned
         as a list instead.

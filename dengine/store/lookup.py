@@ -43,11 +43,12 @@ class DecisionIndex:
     def add(self, entry: Entry) -> None:
         """Add a decision or label that was just recorded; an event, without an id, changes nothing.
 
-        `entry` holds this record. It replaces an earlier decision with the same id, or an earlier
-        label of the same decision. A decision enters `recent`, the newest decisions by id, and the
-        oldest leaves it if there are then more than N_RECENT (1,000). A decision that replaces one
-        in `recent` keeps its place in the order, and any other is the newest. `find` finds a
-        decision that left `recent` until the database has it.
+        `entry` holds this record, and says whether it is on disk. The record replaces an earlier
+        decision with the same id, or an earlier label of the same decision. A decision enters
+        `recent`, the newest decisions by id, and the oldest leaves it if there are then more than
+        N_RECENT (1,000). A decision that replaces one in `recent` keeps its place in the order, and
+        any other is the newest. `find` finds a decision that left `recent` until the database has
+        it.
         """
         record = entry.record
         if isinstance(record, StoredDecision):

@@ -147,9 +147,9 @@ def newest_of(
 def join_product(connection: sa.Connection, cell_id: str, product: str | None) -> str | None:
     """Return a cell's product, or None; make a new robot cell a cell of `product`.
 
-    Cells of one product share labels and versions. A new cell gets a row in the table `setting`,
-    and the product is locked until the transaction ends; nothing is committed. If the cell has this
-    product already, nothing is changed.
+    Cells of one product share labels and trained models. A new cell gets a row in the table
+    `setting`, and the product is locked until the transaction ends; nothing is committed. If the
+    cell has this product already, nothing is changed.
 
     Parameters
     ----------
@@ -259,10 +259,10 @@ def past_query(cell_id: str) -> sa.Select[Any]:
     """Return the query for a cell's decisions with their corrected labels; it is not run.
 
     `read_decision` reads its rows: all columns of a decision, and of its label success (None if a
-    person has withdrawn it), source (where it came from), number and time. The source is "stop"
-    (the accepted part was bad and stopped the line) if it was "confirmed" (the part counted as
-    good) and the label was corrected to bad. Decisions without a label are included; traces are
-    not. The rows are in no order.
+    person has withdrawn it), source (where it came from), number (that of its row) and time. The
+    source is "stop" (the accepted part was bad and stopped the line) if it was "confirmed" (the
+    part counted as good) and the label was corrected to bad. Decisions without a label are
+    included; traces are not. The rows are in no order.
     """
     return (
         sa.select(

@@ -159,8 +159,9 @@ class Tally:
     def by(self, field: str) -> Counter[Any]:
         """Return the number of decisions for each value of a field of `DecisionGroup`.
 
-        `field` is the name of a field or property, like "action" or "label". A value that no
-        decision has counts 0, as always in a `Counter`.
+        The decisions of a group are equal in all its fields. `field` is the name of a field or
+        property, like "action" or "label". A value that no decision has counts 0, as always in a
+        `Counter`.
         """
         counts: Counter[Any] = Counter()
         for group in self.groups:

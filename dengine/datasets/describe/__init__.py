@@ -115,14 +115,16 @@ def choose_files(p: Proposal, root: Path) -> bool:
 
     `p` is the description so far; keys that the user stated stay. If `root` is a file, it is the
     only one. In a folder they are the files that match the stated patterns `files`. If none are
-    stated, they are the files with the only likely ending (`likely_endings`). If several endings
-    are likely, `files` is set to `?` (the user must answer) with a note that lists them, a note on
-    `channels` says that the channels follow from `files`, and the result is False. If it is True,
-    `p.base` is the folder, `p.names` has these files, and `p.others` the other files that may be
-    recordings by their name (`names_in` without patterns). `files` becomes patterns that match
-    `p.names`, like `*.csv`, and `format` that of the first file's suffix, `text` for an unknown
-    one. `exclude`, the patterns of files that are no recordings, is not looked at. Raises DataError
-    if there is no file of recordings or a stated pattern is malformed.
+    stated, they are the files with the only likely ending, as a rule one that several files have
+    (`likely_endings`). If several endings are likely, `files` is set to `?` (the user must answer)
+    with a note that lists them, a note on `channels` says that the channels follow from `files`,
+    and the result is False. If it is True, `p.base` is the folder, `p.names` has these files, and
+    `p.others` the other files with a suffix of recordings, like `.json` (`names_in`). `files`
+    becomes patterns that match `p.names`, like `*.csv`, and `format` that of the first file's
+    suffix, `text` for an unknown one. `exclude`, the patterns of files that are no recordings, is
+    not looked at. Raises DataError if there is no file of recordings, a stated pattern is
+    malformed, or, without stated patterns, all likely endings are of formats that dengine does not
+    read (`FOREIGN`).
     """
     stated = p.description.files
     every = names_in(root, ())

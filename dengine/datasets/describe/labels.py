@@ -209,11 +209,13 @@ def sources_of(p: Proposal, paths: Names) -> Iterator[LabelSource]:
 def words_of(p: Proposal, source: LabelSource, tables: Tables, parts: Words) -> Words:
     """Return the word of each recording that has one in a source, by its `Table.source`.
 
-    `tables` has the table of each recording, and `parts` their part numbers. A recording for which
-    a listing has rows with different words has none. The mapping is empty if no recording has a
-    word, also because `source.path` is no regular expression with one group; but if the source is
-    the stated one, `p.description.label`, DataError is raised then. Raises DataError if the
-    source's listing cannot be read or lacks a column.
+    A word is a text like "ok" that stands for a label; `source` says where it stands, for example
+    in a listing (a file with a row for each recording or part). `p` is the description as far as it
+    is made, `tables` has the table of each recording, and `parts` their part numbers. A recording
+    for which the listing has rows with different words has none. The mapping is empty if no
+    recording has a word, also because `source.path` is no regular expression with one group; but if
+    the source is `p.description.label`, which the user stated, DataError is raised then. Raises
+    DataError if the source's listing cannot be read or lacks a column.
     """
     words = dict[str, str]()
     faults = list[Fault]()

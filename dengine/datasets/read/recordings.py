@@ -36,17 +36,18 @@ WORDS = {1: "good", 0: "bad", None: "not checked"}
 def recording_of(
     table: Table, description: Description, labels: Sequence[LabelReader]
 ) -> Recording | None:
-    """Return the recording of a part; None if the part was not checked.
+    """Return the recording of a part; None if it has no label, because it was not checked.
 
     The description says how the table of a part is read. Rows that its section `[rows]` drops, by a
     word in some column, are left out, then rows are sorted by time if `time.sort` is set, and their
     times are checked (`check_steps`); samples of rows that `[rows]` calls invalid are NaN. The
-    `length` of the recording is the number of rows kept. A reader of a listing, a file with a row
-    for each recording or part, adds the key that it found to its `used`. The times and samples of a
-    part that was not checked must be readable, too, but may be of any length. If the description
-    says nothing of part numbers, a part that was cut out of a long recording (`[windows]`) has as
-    part number its key in the listing of such parts, or its number from 1 if a trigger, a condition
-    on a signal, cuts.
+    `length` of the recording is the number of rows kept, and its `rank` is what recordings are
+    sorted by, as `order` of the description says. A reader of a listing, a file with a row for each
+    recording or part, adds the key that it found to its `used`. The times and samples of a part
+    that was not checked must be readable, too, but may be of any length. If the description says
+    nothing of part numbers, a part that was cut out of a long recording (`[windows]`) has as part
+    number its key in the listing of such parts, or its number from 1 if a trigger, a condition on a
+    signal, cuts.
 
     Parameters
     ----------
@@ -60,7 +61,7 @@ def recording_of(
     ------
     UnreadableError
         If the table does not follow the description, is damaged, or has too few or too many samples
-        (see `fitted`).
+        for a trace, by its section `[traces]`.
     DataError
         If a regular expression or a format of times in the description is invalid.
     """
