@@ -465,8 +465,10 @@ class CellService:
         if self._closing:
             return
         self._closing = True
-        self._jobs.put(None)
-        self._thread.join()
+        while self._thread.is_alive():  # if it has died, nobody makes room in a full queue
+            with suppress(queue.Full):
+                self._jobs.put(None, timeout=IDLE_WAIT)
+                self._thread.join()
         with suppress(queue.Empty):
             while True:
                 job = self._jobs.get_nowait()

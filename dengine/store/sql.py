@@ -207,11 +207,11 @@ def _checked_wait(wait: float | None) -> float:
     """Return a store's time limit in seconds; raise StoreError unless it is above 0 and finite.
 
     It is `wait`, or if that is None the environment's DENGINE_STORE_WAIT, or 0.4 if that is not set
-    or empty. A text that is no number is refused like 0.
+    or empty. A value that is no number is refused like 0, and so is an int too large for a float.
     """
     value = (os.environ.get(WAIT_VARIABLE) or WAIT) if wait is None else wait
     seconds = math.nan
-    with suppress(ValueError):
+    with suppress(ValueError, TypeError, OverflowError):
         seconds = float(value)
     expect(
         0.0 < seconds < math.inf,

@@ -9,7 +9,7 @@ from contextlib import closing
 import pytest
 
 from dengine import Action, DataEngine, Reason
-from dengine.errors import StoreError, TraceError
+from dengine.errors import BusyError, StoreError, TraceError
 from dengine.serve.service import CellService
 from tests.support.serving import RECIPE, WAIT, a_service, busy_engine
 
@@ -92,3 +92,30 @@ def test_a_service_whose_second_connection_fails_closes_its_engine_and_ends_its_
         CellService(lambda: DataEngine.open_or_create(tmp_path / "a.db"), tmp_path / "no" / "b.db")
     assert "dengine-engine" not in [thread.name for thread in threading.enumerate()]
     DataEngine.open(tmp_path / "a.db").close()
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+def test_a_service_whose_thread_died_behind_a_full_line_closes_all_the_same(tmp_path):
+    is_polling = threading.Event()
+    is_full = threading.Event()
+
+    def die(**brief):
+        is_polling.set()
+        is_full.wait(WAIT)
+        raise SystemExit
+
+    def make():
+        engine = DataEngine.open_or_create(tmp_path / "a.db")
+        engine.poll = die
+        return engine
+
+    service = CellService(make, max_waiting=1)
+    assert is_polling.wait(WAIT)  # the thread takes no job any more
+    waiting = service.submit(lambda engine, late: None)
+    is_full.set()
+    closing_thread = threading.Thread(target=service.close, daemon=True)
+    closing_thread.start()
+    closing_thread.join(WAIT)
+    assert not closing_thread.is_alive()
+    with pytest.raises(BusyError):
+        waiting.result(0)

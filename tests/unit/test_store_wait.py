@@ -7,6 +7,7 @@ import pytest
 
 from dengine import DataEngine
 from dengine.errors import StoreError
+from dengine.store.sql import SqlStore
 
 
 @pytest.mark.parametrize(
@@ -26,6 +27,12 @@ def test_an_environment_that_says_no_seconds_is_named(text, tmp_path, monkeypatc
     monkeypatch.setenv("DENGINE_STORE_WAIT", text)
     with pytest.raises(StoreError, match="Expected DENGINE_STORE_WAIT above 0 seconds"):
         DataEngine(store=tmp_path / "a.db")
+
+
+@pytest.mark.parametrize("wait", [[0.4], object(), 10**400])
+def test_a_wait_that_is_no_number_of_seconds_is_named(wait, tmp_path):
+    with pytest.raises(StoreError, match="Expected a wait above 0 seconds"):
+        SqlStore(tmp_path / "a.db", wait=wait)
 
 
 FULL_DISK = """
