@@ -9,7 +9,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from concurrent.futures import Future, wait
+from concurrent.futures import Future
 from contextlib import suppress
 from itertools import islice
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 DRAIN_SECONDS = 0.25  # synced records wait so long for others before they are drained together
 LAG_SECONDS = 1.0  # a larger lag is a fault of the store
-COMMIT_SECONDS = 2.0  # beyond the time limit, for a commit under way: it may still succeed
+Call = tuple[Future[Any], Callable[[], Any]]  # what the thread is to call, and its result
 
 
 class Drainer:
@@ -68,7 +68,7 @@ class Drainer:
         self._wanted = 0  # up to this record somebody waits for the database
         self._error = ""
         self._label_numbers: LabelNumbers = []  # of a product, not yet collected
-        self._calls: deque[tuple[Future[Any], Callable[[], Any]]] = deque()
+        self._calls: deque[Call] = deque()
         self._stopped = False
         self._thread = threading.Thread(target=self._run, name="dengine-store", daemon=True)
 
@@ -180,25 +180,6 @@ class Drainer:
             self._changed.notify_all()
         return future
 
-    def wait_for_result(self, future: Future[T]) -> T:
-        """Wait for a submitted call; return its result, or raise what it raised.
-
-        The time limit includes the wait for the calls before it.
-
-        Raises
-        ------
-        StoreError
-            If the call takes longer than `limit` seconds. It is then cancelled, so that it commits
-            nothing. A call that is already committing cannot be cancelled, and gets COMMIT_SECONDS
-            (2 s) more; if StoreError is raised after these, the call may still have committed, or
-            do so later.
-        """
-        if not wait([future], self._limit).done and not future.cancel():
-            wait([future], COMMIT_SECONDS)
-        if future.cancelled() or not future.done():
-            raise StoreError(f"no answer from the store within {self._limit:g} s.")
-        return future.result()
-
     def start(self) -> None:
         """Start the thread, and have it drain before anybody else uses the store.
 
@@ -248,7 +229,11 @@ class Drainer:
             try:
                 self._drain_synced()
             except Exception as error:  # whatever it is, the cell goes on, and this thread too
-                self._note_error(error)
+                with self._changed:
+                    if not self._error:
+                        log.warning("labels wait in the journal beside the store: %s", error)
+                    self._error = str(error)
+                    self._changed.notify_all()
             if call is not None:
                 self._make_call(*call)
             with self._changed:
@@ -258,7 +243,7 @@ class Drainer:
                 if self._error:
                     self._changed.wait_for(lambda: self._calls or self._stopped, RETRY_SECONDS)
 
-    def _wait_for_work(self) -> tuple[Future[Any], Callable[[], Any]] | None:
+    def _wait_for_work(self) -> Call | None:
         """Wait until there is a call, `stop` was called, or it is time to drain records.
 
         To drain records is to copy them from the journal, a local file, to the database. Return the
@@ -278,18 +263,6 @@ class Drainer:
                 DRAIN_SECONDS,
             )
             return self._calls.popleft() if self._calls else None
-
-    def _note_error(self, error: Exception) -> None:
-        """Keep an error of the copying to the database for `fault`, and wake those who wait.
-
-        `fault` says why the store cannot be used now. The error is logged only if neither an
-        earlier error nor a timeout of `drain` is kept there.
-        """
-        with self._changed:
-            if not self._error:
-                log.warning("labels wait in the journal beside the store: %s", error)
-            self._error = str(error)
-            self._changed.notify_all()
 
     def _drain_synced(self) -> None:
         """Copy all records that are now on disk in the journal (a local file) to the database.

@@ -126,7 +126,13 @@ class RecordInsertion:
         numbers |= zip(new, new_numbers, strict=True)
         self._insert_events(connection, events, problems)
         for id_ in late_stops:
-            self._correct_confirmation(connection, id_)
+            event = new_event(
+                "late stop",
+                f"decision {as_text(id_)} counts as a failure, was a success: its stop came after "
+                "its confirmation",
+                self._database.clock(),
+            )
+            self._corrections.insert(connection, event, False, {id_: True})
         return [(id_, numbers[id_]) for id_ in labelled]
 
     def _insert_decisions(
@@ -151,7 +157,10 @@ class RecordInsertion:
             row = stored.get(item.decision.id)
             if row is None:
                 new.append(item)
-            elif different := _differences(item, row):
+                continue
+            given = decision_row(item) | trace_row(item)
+            different = [name for name, value in given.items() if row._mapping[name] != value]
+            if different:
                 problems.append(
                     f"{_describe(item)}, of which the store holds another: "
                     f"{', '.join(different)} differ"
@@ -184,19 +193,6 @@ class RecordInsertion:
             new.append(new_event("dead letter", problem, self._database.clock()))
         self._database.insert(connection, EVENT.c.number, [to_row(event) for event in new])
 
-    def _correct_confirmation(self, connection: sa.Connection, decision_id: str) -> None:
-        """Correct a label to failure: the part had counted as good, and stopped the line later.
-
-        An event "late stop" is inserted with the correction; nothing is committed.
-        """
-        event = new_event(
-            "late stop",
-            f"decision {as_text(decision_id)} counts as a failure, was a success: its stop came "
-            "after its confirmation",
-            self._database.clock(),
-        )
-        self._corrections.insert(connection, event, False, {decision_id: True})
-
 
 def _find_problem(label: NewLabel, row: Any, first: Any) -> str:
     """Return in words why the store cannot take a label; "" if it can.
@@ -224,16 +220,6 @@ def _is_late_stop(label: NewLabel, first: Any) -> bool:
     It had if `first`, its first label, is CONFIRMED: the next part came, and no stop was reported.
     """
     return ((first.success, first.source), (label.success, label.source)) == LATE_STOP
-
-
-def _differences(item: StoredDecision, row: Any) -> list[str]:
-    """Return the names of the columns in which a decision and its stored row differ.
-
-    The row must have the columns of the decision and of its trace. The number is not compared. []
-    if they are equal.
-    """
-    given = decision_row(item) | trace_row(item)
-    return [name for name, value in given.items() if row._mapping[name] != value]
 
 
 def _describe(record: Record) -> str:

@@ -193,7 +193,8 @@ class Journal:
                 self._scan()
                 if owning:
                     self._file.truncate(self.end)
-                    self._write_header_and_reserve()
+                    self._write_header()
+                    self.reserve()
         except StoreError:
             self._file.close()
             raise
@@ -387,7 +388,8 @@ class Journal:
                     lost.read(self.end - self.drained_to, self.drained_to), self.drained_to
                 )
                 self._file.truncate(self.end)  # no records of another file behind ours
-                self._write_header_and_reserve()
+                self._write_header()
+                self.reserve()
         except StoreError:
             lost, self._file = self._file, lost
             raise
@@ -426,14 +428,6 @@ class Journal:
             "n_drained": self.head.n_drained,
         }
         self._file.write((MAGIC + _pack_fields(fields)).ljust(HEADER, b"\0"), 0)
-
-    def _write_header_and_reserve(self) -> None:
-        """Write the header, and reserve disk space for records.
-
-        Raise OSError if the header cannot be written, and StoreError if the sync fails.
-        """
-        self._write_header()
-        self.reserve()
 
     def _scan(self) -> None:
         """Read the header and all records that the store lacks; set the journal's attributes.

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Iterable
-from concurrent.futures import Future
+from concurrent.futures import Future, wait
 from contextlib import suppress
 from dataclasses import replace
 from itertools import islice
@@ -34,6 +34,7 @@ T = TypeVar("T")
 NO_LIMIT = 1e9  # seconds: never reached
 # Opening waits so long for SQLite's check; that of a large store goes on beside.
 CHECK_SECONDS = 0.1
+COMMIT_SECONDS = 2.0  # beyond the time limit, for a commit under way: it may still succeed
 CLOSE_SECONDS = 5.0  # the longest that closing waits
 
 
@@ -364,12 +365,19 @@ class JournalledStore(Outbox):
         return self._drainer.submit(lambda: self.store.versions.put(report, last_seq, state))
 
     def wait_for_result(self, future: Future[T]) -> T:
-        """Return the result of a future of `store_version`, or raise what its commit raised.
+        """Wait for a submitted call, like a commit of `store_version`; return its result.
 
-        Raise StoreError if it takes longer than `limit` seconds. The commit is then cancelled,
-        unless it is under way (`Drainer.wait_for_result`).
+        Raise what the call raised. The time limit includes the wait for the calls before it. Raise
+        StoreError if it takes longer than `limit` seconds. It is then cancelled, so that it commits
+        nothing. A call that is already committing cannot be cancelled, and gets COMMIT_SECONDS
+        (2 s) more; if StoreError is raised after these, the call may still have committed, or do so
+        later.
         """
-        return self._drainer.wait_for_result(future)
+        if not wait([future], self.limit).done and not future.cancel():
+            wait([future], COMMIT_SECONDS)
+        if future.cancelled() or not future.done():
+            raise StoreError(f"no answer from the store within {self.limit:g} s.")
+        return future.result()
 
     def close(self) -> None:
         """Copy the recorded decisions, labels and events to the database; close store and journal.

@@ -39,7 +39,7 @@ class MemoryStore(Outbox):
 
     is_thread_safe = False
 
-    def __init__(self, store: SqlStore, window: int, reading: bool = False) -> None:
+    def __init__(self, store: SqlStore, window: int, reading: bool) -> None:
         super().__init__(store, window, math.inf, reading)
         self._unwritten: list[Record] = []
         self._versions: list[tuple[Any, ...]] = []  # not written: arguments of `versions.put`

@@ -83,7 +83,7 @@ class OwnedFile:
         Whatever else the system reports.
     """
 
-    def __init__(self, path: Path, owning: bool = True) -> None:
+    def __init__(self, path: Path, owning: bool) -> None:
         self.path = path
         self._seeking = threading.Lock()
         self._fd = self._open_and_lock() if owning else open_plain(path, os.O_RDONLY)

@@ -157,8 +157,7 @@ class Recorder:
         with self.changed:
             place = self.n_recorded
             n_failed = self._n_failed
-            self._wanted = place
-            self.changed.notify_all()
+            self.request_sync()
             self.changed.wait_for(
                 lambda: self.n_synced >= place or self._n_failed > n_failed, limit
             )
@@ -235,8 +234,11 @@ class Recorder:
         threads that wait for `changed` are woken. A journal of more than 8 MiB is cleared first, if
         the `Drainer` copies its last records to the database within BATCH_SECONDS (0.05 s). If the
         journal's file was deleted, moved or replaced, it is created again, which is logged and
-        recorded as an event. Raise StoreError if the disk fails, or that file cannot be created;
-        the entries then stay in `unwritten`.
+        recorded as an event: records that the database lacks are copied into it from the lost file,
+        which is still open, and a file that is at its path by now is written over. Raise StoreError
+        if the disk fails, if that file cannot be created or is locked by another engine, or if the
+        lost file cannot be read (the journal then still uses the lost file); the entries then stay
+        in `unwritten`.
         """
         if self._journal.end > LONG:  # a cell that never pauses would fill the disk
             with self.changed:
@@ -250,7 +252,12 @@ class Recorder:
         try:
             offsets = self._journal.append(blobs, self._clock())
         except LostJournalError as error:
-            self._recreate(error)
+            log.error("%s It is created again with what the store lacks.", error)
+            with self.changed:  # nobody reads it or writes its header meanwhile
+                self._journal.recreate()
+            self.record_event(
+                "journal", f"{error} It was created again with what the store lacked."
+            )
             offsets = self._journal.append(blobs, self._clock())
         with self.changed:
             ends = [*offsets[1:], self._journal.end]
@@ -262,17 +269,3 @@ class Recorder:
             self._error = ""
             self._began = math.inf
             self.changed.notify_all()
-
-    def _recreate(self, error: LostJournalError) -> None:
-        """Create a new file for a journal whose file was lost; log this, and record an event.
-
-        Records that the database lacks are copied into it from the lost file, which is still open.
-        A file that is at its path by now is written over. `error` is the text of log and event.
-        Raise StoreError, after the log line but without an event, if the file cannot be written,
-        another engine has locked it, or the lost file cannot be read; the journal then still uses
-        the lost file.
-        """
-        log.error("%s It is created again with what the store lacks.", error)
-        with self.changed:  # nobody reads it or writes its header meanwhile
-            self._journal.recreate()
-        self.record_event("journal", f"{error} It was created again with what the store lacked.")
