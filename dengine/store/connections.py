@@ -29,7 +29,7 @@ from .ledger import (
 )
 from .queries import Scope, join_product
 from .records import Clock, EntryName, Row, as_text, chunks
-from .schema import CELL, DECISION, LEDGER, check_schema, lock, prepare_tables
+from .schema import CELL, DECISION, LEDGER, Query, check_schema, lock, prepare_tables
 
 T = TypeVar("T")
 
@@ -626,7 +626,7 @@ class Database:
                 if self._closed:  # meanwhile, by a `close` that did not wait
                     self._disconnect()
 
-    def read(self, query: sa.Select[Any]) -> Sequence[Any]:
+    def read(self, query: Query) -> Sequence[Any]:
         """Run a query in a read transaction of its own, and return all its rows.
 
         The records that wait in the outbox are written first, if the database takes them in time.
@@ -693,7 +693,7 @@ class Database:
         return [row[column.name] for row in numbered]
 
     def rows_by_id(
-        self, connection: sa.Connection, query: sa.Select[Any], ids: Sequence[str]
+        self, connection: sa.Connection, query: Query, ids: Sequence[str]
     ) -> dict[str, Any]:
         """Run a query over decisions for the given ids of this robot cell; return the rows by id.
 

@@ -22,7 +22,7 @@ from .queries import (
     past_query,
 )
 from .records import CHUNK, StoredDecision, from_row, read_decision
-from .schema import CORRECTION, DECISION, LABEL, TRACE
+from .schema import CORRECTION, DECISION, LABEL, TRACE, Query
 from .views import LABELS, DecisionGroup, HistoryFilter, Stretch, Tally
 
 
@@ -184,9 +184,7 @@ class DecisionTable(CellTable):
             for row in self._read(self._unlabelled_query(Action.VERIFY, since_version, *DECISION.c))
         ]
 
-    def _unlabelled_query(
-        self, action: Action, since_version: int, *columns: Any
-    ) -> sa.Select[Any]:
+    def _unlabelled_query(self, action: Action, since_version: int, *columns: Any) -> Query:
         """Return the query for the cell's decisions of an action that have no label, oldest first.
 
         A forgotten label (which a person withdrew) is a label here. Decisions on quarantined traces
@@ -201,8 +199,8 @@ class DecisionTable(CellTable):
                 LABEL.c.seq.is_(None),
                 self._own(DECISION),
                 DECISION.c.quarantined == sa.false(),
+                DECISION.c.model_version >= since_version,
             )
-            .where(DECISION.c.model_version >= since_version)
             .order_by(DECISION.c.number)
         )
 
@@ -337,7 +335,7 @@ class DecisionTable(CellTable):
             sa.func.sum(sa.case((condition, 1), else_=0)) for condition in conditions
         ]
         rows = self._read(
-            sa.select(*[sa.func.count(), sa.func.max(DECISION.c.time), *counts])
+            sa.select(sa.func.count(), sa.func.max(DECISION.c.time), *counts)
             .select_from(WITH_LABELS)
             .where(self._own(DECISION))
             .group_by(stretch)
@@ -370,7 +368,8 @@ class DecisionTable(CellTable):
         reasons = tally.by("reason")
         sources: Counter[Any] = Counter()
         for group in tally.groups:
-            sources[group.source] += group.n if group.success is not None else 0
+            if group.success is not None:
+                sources[group.source] += group.n
         forgotten = tally.by("label")["forgotten"]
         corrected = self._read(
             sa.select(sa.func.count(CORRECTION.c.decision_id.distinct())).where(

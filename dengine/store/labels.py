@@ -33,7 +33,7 @@ from .records import (
     overdue_outcomes,
     unpack,
 )
-from .schema import DECISION, LABEL, TRACE
+from .schema import DECISION, LABEL, TRACE, Query
 from .views import PastLabel
 
 
@@ -116,8 +116,12 @@ class LabelTable(CellTable):
                 LABEL.c.decision_id.label("labelled_id"),
             )
             .select_from(LABEL.outerjoin(TRACE, TRACE_OF_LABEL))
-            .where(scope.shared(LABEL.c.cell_id), TRAINS, label != FORGOTTEN)
-            .where(LABEL.c.seq >= int(first))
+            .where(
+                scope.shared(LABEL.c.cell_id),
+                TRAINS,
+                label != FORGOTTEN,
+                LABEL.c.seq >= int(first),
+            )
             .order_by(LABEL.c.seq.desc())
             .limit(limit)
         )
@@ -149,7 +153,7 @@ class LabelTable(CellTable):
         return LabelledTraces(seq, stacked, labels.astype(np.int8), hashes)
 
     def _read_newest(
-        self, connection: sa.Connection, query: sa.Select[Any], limit: int | None, last: int | None
+        self, connection: sa.Connection, query: Query, limit: int | None, last: int | None
     ) -> Iterable[Any]:
         """Run a query for the newest `limit` labels up to number `last`; return rows, newest first.
 

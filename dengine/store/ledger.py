@@ -284,7 +284,7 @@ class LedgerEntry:
         Whether the transaction changes settings; set by `chain_writes`.
     """
 
-    def __init__(self, connection: sa.Connection, cell_id: str, key: bytes = b"") -> None:
+    def __init__(self, connection: sa.Connection, cell_id: str, key: bytes) -> None:
         self._connection = connection
         self._cell_id = cell_id
         self._key = key
@@ -335,7 +335,7 @@ class LedgerEntry:
         """
         if not (self._sums or self.settings):
             return None
-        chains = dict(self._chains)
+        chains = self._chains
         for name in IN_FORCE:
             if name in self._sums:
                 chains[name] = _extend_chain(chains.get(name, ""), self._sums[name])
@@ -392,7 +392,7 @@ def find_integrity_error(connection: sa.Connection, cell_id: str, key: bytes, fi
         .order_by(LEDGER.c.number.desc())
         .limit(2)
     )
-    newest, before = [*(dict(row._mapping) for row in rows), {}, {}][:2]
+    newest, before = [*(row._asdict() for row in rows), {}, {}][:2]
     previous = before.get("digest", START)
     if newest and entry_digest(previous, newest | {"digest": None}, key) != newest["digest"]:
         return "the newest entry of the ledger is not as it was written"
@@ -456,7 +456,7 @@ def _find_table_error(
         .order_by(number)
     )
     for _, group in groupby(rows, lambda row: row.entry):
-        entry_rows = [dict(row._mapping) for row in group]
+        entry_rows = [row._asdict() for row in group]
         if changed := [row for row in entry_rows if row_sum(name, row) != row["sum"]]:
             return f"the {name} {changed[0][number.name]} is not as it was written"
         chain = _extend_chain(chain, [row["sum"] for row in entry_rows])

@@ -4,7 +4,6 @@
 product does. The command line and `SqlStore` use them.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,6 +13,7 @@ from ..errors import SettingError, StoreError
 from ..recipe import Recipe
 from .connections import reading
 from .queries import Scope
+from .records import Settings
 from .schema import DECISION, LABEL, PRODUCT_KEY, SETTING
 
 # Settings of a recipe on which the arrays of a version depend.
@@ -47,7 +47,7 @@ class CellSummary:
 
 
 def check_peer_settings(
-    settings: Mapping[str, str], peer_settings: Mapping[str, str], name: str, product: str
+    settings: Settings, peer_settings: Settings, name: str, product: str
 ) -> None:
     """Check that two robot cells of a product would embed a trace in the same way.
 
@@ -91,7 +91,7 @@ def check_peer_settings(
         )
 
 
-def _embedding_settings(settings: Mapping[str, str]) -> dict[str, Any]:
+def _embedding_settings(settings: Settings) -> dict[str, Any]:
     """Return the settings on which an embedding depends, by name, of a cell's stored settings.
 
     They are those in EMBEDDING, seed, trace, model and described. Those that are not stored are

@@ -22,6 +22,7 @@ from .schema import (
     SETTING,
     TRACE,
     VERSION,
+    Query,
     insert_settings,
     lock,
     read_setting,
@@ -98,15 +99,25 @@ class Scope:
     ) -> int:
         """Return the largest number in a column over the cell's rows.
 
-        If the robot cell has a product (robot cells that share labels and versions), the rows of
-        all its cells count. With `conditions`, only over the rows that fulfil them all. 0 if there
-        is none.
+        `column` has a table's row numbers. If the robot cell has a product (robot cells that share
+        labels and versions), the rows of all its cells count; in the table of versions each cell's
+        newest retrain that fulfils the conditions counts then, so `column` must increase with the
+        table's column `retrain`. With `conditions`, only over the rows that fulfil them all. 0 if
+        there is none.
         """
-        query = sa.select(sa.func.max(column)).where(
-            column.table.c.cell_id == self.cell_id, *conditions
-        )
-        if self.product is not None:
-            query = newest_of(self.product, column, *conditions)
+        table = column.table
+        if self.product is None:
+            query = sa.select(sa.func.max(column)).where(
+                table.c.cell_id == self.cell_id, *conditions
+            )
+        else:
+            peer = cells_of(self.product).subquery()
+            # For each cell the database reads the index from its end, one row if the conditions
+            # hold there. The index of versions is that of their retrains.
+            order = VERSION.c.retrain if table is VERSION else column
+            of_peer = sa.select(column).where(table.c.cell_id == peer.c.cell_id, *conditions)
+            newest = of_peer.order_by(order.desc()).limit(1).correlate(peer).scalar_subquery()
+            query = sa.select(sa.func.max(newest)).select_from(peer)
         return connection.execute(query).scalar() or 0
 
     def newest_version(self, connection: sa.Connection) -> int:
@@ -117,31 +128,11 @@ class Scope:
         return self.newest(connection, VERSION.c.version, VERSION.c.accepted == sa.true())
 
 
-def cells_of(product: str) -> sa.Select[Any]:
+def cells_of(product: str) -> Query:
     """Return the query for the ids of a product's robot cells, in no order; it is not run."""
     return sa.select(SETTING.c.cell_id).where(
         SETTING.c.key == PRODUCT_KEY, SETTING.c.value == product
     )
-
-
-def newest_of(
-    product: str, column: sa.Column[Any], *conditions: sa.ColumnElement[bool]
-) -> sa.Select[Any]:
-    """Return the query for the largest number in a column over a product's robot cells.
-
-    It is not run. A product is robot cells that share labels and versions. With `conditions`, only
-    over the rows that fulfil them all. The result is NULL if there is none. `column` has a table's
-    row numbers. In the table of versions each cell's newest retrain that fulfils the conditions
-    counts, so `column` must increase with the table's column `retrain`. The query is fast: for each
-    cell the database reads the index from its end, one row if the conditions hold there.
-    """
-    table = column.table
-    peer = cells_of(product).subquery()
-    # By the index's own order, in which the numbers of versions increase too.
-    order = VERSION.c.retrain if table is VERSION else column
-    query = sa.select(column).where(table.c.cell_id == peer.c.cell_id, *conditions)
-    newest = query.order_by(order.desc()).limit(1).correlate(peer).scalar_subquery()
-    return sa.select(sa.func.max(newest)).select_from(peer)
 
 
 def join_product(connection: sa.Connection, cell_id: str, product: str | None) -> str | None:
@@ -255,7 +246,7 @@ SOURCE: sa.ColumnElement[str | None] = sa.case(
 )
 
 
-def past_query(cell_id: str) -> sa.Select[Any]:
+def past_query(cell_id: str) -> Query:
     """Return the query for a cell's decisions with their corrected labels; it is not run.
 
     `read_decision` reads its rows: all columns of a decision, and of its label success (None if a

@@ -48,6 +48,7 @@ LOSS_REMEDY = (
 T = TypeVar("T")
 Clock = Callable[[], float]  # returns the time, in seconds since 1970
 Row = dict[str, Any]  # the values of a row, by column
+Settings = Mapping[str, str]  # an engine's, as texts, by name
 LabelNumbers = list[tuple[str, int]]  # ids of decisions, with the numbers of their labels
 EntryName = tuple[int, str]  # number and digest, hexadecimal, of a ledger entry
 NO_TRACE: TraceArray = np.zeros((0, 0), dtype=np.float32)
@@ -119,22 +120,6 @@ def nothing_to_correct(decision_id: str) -> ReportError:
         f"Expected a decision with a label, got {decision_id!r}, of which nothing was reported "
         "yet; there is nothing to correct: report its label."
     )
-
-
-def as_data(data: Mapping[str, Any] | None) -> dict[str, Any] | None:
-    """Return an event's data in a new dict, as if it was written to JSON and read; None for None.
-
-    A tuple becomes a list, and a key that is a number, a bool or None becomes a text. Raise
-    StoreError for values that JSON does not have, NaN and infinity included.
-    """
-    with instead(
-        StoreError,
-        "Expected an event's data as JSON has it",
-        TypeError,
-        ValueError,
-        do="give numbers and text",
-    ):
-        return None if data is None else dict(json.loads(json.dumps(dict(data), allow_nan=False)))
 
 
 def as_text(text: str) -> str:
@@ -383,10 +368,19 @@ def new_event(
     """Return an event that is not numbered yet, in texts and data that every database takes.
 
     Its number is 0. In `kind`, `text` and `author` a NUL and half a surrogate pair become escapes;
-    `data` is copied as if it was written to JSON and read (`as_data`). Nothing is stored. Raise
-    StoreError for data that JSON does not have.
+    `data` is copied as if it was written to JSON and read: a tuple becomes a list, and a key that
+    is a number, a bool or None becomes a text. Nothing is stored. Raise StoreError for data that
+    JSON does not have, NaN and infinity included.
     """
-    return Event(0, float(time), as_text(kind), as_text(text), as_data(data), as_text(author))
+    with instead(
+        StoreError,
+        "Expected an event's data as JSON has it",
+        TypeError,
+        ValueError,
+        do="give numbers and text",
+    ):
+        copied = None if data is None else json.loads(json.dumps(dict(data), allow_nan=False))
+    return Event(0, float(time), as_text(kind), as_text(text), copied, as_text(author))
 
 
 def open_losses(events: Iterable[Any]) -> list[Any]:
@@ -429,7 +423,7 @@ class Change:
     decisions: Sequence[str] = ()
     success: bool | None = None
     version: tuple[RetrainReport, int, Arrays] | None = None
-    settings: Mapping[str, str] | None = None
+    settings: Settings | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -514,7 +508,7 @@ class CellAddress(str):
         return address
 
 
-def address(store: FilePath, cell_id: str | None = None, product: str | None = None) -> str:
+def address(store: FilePath, cell_id: str | None, product: str | None = None) -> str:
     """Return a store's file or URL as text; a `CellAddress` if a robot cell or product is given.
 
     A `CellAddress` is a text with the attributes `cell_id` and `product` (what the cell makes;

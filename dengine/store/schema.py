@@ -4,7 +4,6 @@ Their columns are the fields of the records that they hold (see records.py), and
 to a cell, `cell_id`. `Database` and the queries use them.
 """
 
-from collections.abc import Mapping
 from enum import StrEnum
 from typing import Any
 
@@ -13,7 +12,7 @@ import sqlalchemy as sa
 
 from ..errors import StoreError
 from ..records import Decision, RetrainReport
-from .records import OF_DECISION, Correction, Event, NewLabel, StoredDecision, columns
+from .records import OF_DECISION, Correction, Event, NewLabel, Settings, StoredDecision, columns
 
 SCHEMA = "1"
 # Keys of rows of `setting` that the store itself keeps.
@@ -25,6 +24,7 @@ RESERVED = (SCHEMA_KEY, PRODUCT_KEY, LEDGER_KEY)
 # Kinds of locks, as numbers that no other program uses.
 TABLES, PRODUCT, CELL = range(7236482514, 7236482517)
 
+Query = sa.Select[Any]
 METADATA = sa.MetaData()
 COLUMN_TYPES: dict[type, Any] = {
     str: sa.String,
@@ -49,7 +49,6 @@ def _columns(record: type, *names: str, key: str = "") -> list[sa.Column[Any]]:
             sa.String if issubclass(type_, StrEnum) else COLUMN_TYPES[type_],
             nullable=optional,
             primary_key=name == key,
-            autoincrement=False,
         )
         for name, (type_, optional) in columns(record).items()
         if not names or name in names
@@ -107,7 +106,7 @@ LABEL = _table(
 VERSION = _table(  # every retrain, dropped candidates included
     "model_version",
     # 1, 2, ... in each cell, or product
-    sa.Column("retrain", sa.BigInteger, primary_key=True, autoincrement=False),
+    sa.Column("retrain", sa.BigInteger, primary_key=True),
     sa.Column("time", sa.Double, nullable=False),
     *_columns(RetrainReport),
     sa.Column("last_seq", sa.BigInteger, nullable=False),
@@ -131,7 +130,7 @@ LEDGER = sa.Table(  # an entry for every transaction that added rows or changed 
     METADATA,
     sa.Column("cell_id", sa.String, primary_key=True),
     # 1, 2, ... in each cell
-    sa.Column("number", sa.BigInteger, primary_key=True, autoincrement=False),
+    sa.Column("number", sa.BigInteger, primary_key=True),
     sa.Column("time", sa.Double, nullable=False),
     sa.Column("added", sa.Text, nullable=False),  # JSON: number of added rows by table
     sa.Column("rows", sa.LargeBinary, nullable=False),  # digest of these rows' sums: `rows_digest`
@@ -209,7 +208,7 @@ def read_setting(connection: sa.Connection, cell_id: str, key: str) -> str | Non
     return connection.execute(query).scalar()
 
 
-def insert_settings(connection: sa.Connection, cell_id: str, settings: Mapping[str, str]) -> None:
+def insert_settings(connection: sa.Connection, cell_id: str, settings: Settings) -> None:
     """Insert settings that a robot cell does not have yet, if any; nothing is committed.
 
     A setting that the cell has already raises SQLAlchemy's IntegrityError.

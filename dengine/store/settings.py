@@ -2,13 +2,12 @@
 cells of its product. `SqlStore` has one.
 """
 
-from collections.abc import Mapping
-
 import sqlalchemy as sa
 
 from ..errors import StoreError
 from .cell_table import CellTable
 from .peers import check_peer_settings
+from .records import Settings
 from .schema import PRODUCT, RESERVED, SETTING, insert_settings, lock, read_settings
 
 
@@ -26,7 +25,7 @@ class SettingTable(CellTable):
         with self._database.reading() as connection:
             return read_settings(connection, self._database.cell_id)
 
-    def save(self, settings: Mapping[str, str]) -> None:
+    def save(self, settings: Settings) -> None:
         """Commit new settings in the place of all present ones.
 
         The settings that the store itself keeps (`RESERVED`) stay. Raise SettingError if those of
@@ -35,7 +34,7 @@ class SettingTable(CellTable):
         """
         self._database.write(lambda connection: self.replace(connection, settings))
 
-    def replace(self, connection: sa.Connection, settings: Mapping[str, str]) -> None:
+    def replace(self, connection: sa.Connection, settings: Settings) -> None:
         """Replace all settings of the robot cell by new ones; nothing is committed.
 
         `connection` must be in a write transaction. `settings` holds texts by name; a present

@@ -358,7 +358,7 @@ class CellCheck:
         for row in self.connection.execute(
             query.execution_options(yield_per=CHUNK), {"cell": self.cell_id}
         ):
-            yield dict(row._mapping)
+            yield row._asdict()
 
     def _check_rows(self, table: str) -> Iterator[HistoryFault]:
         """Yield a fault for each row of a table that was changed or is not in the ledger.

@@ -2,8 +2,6 @@
 versions. `SqlStore` has one.
 """
 
-from typing import Any
-
 import numpy as np
 import sqlalchemy as sa
 
@@ -26,7 +24,7 @@ from .records import (
     to_row,
     without_rule,
 )
-from .schema import PRODUCT, VERSION, lock
+from .schema import PRODUCT, VERSION, Query, lock
 
 
 class VersionTable(CellTable):
@@ -279,7 +277,7 @@ class VersionTable(CellTable):
         """
         return [version.report for version in self.all()]
 
-    def _accepted_query(self) -> sa.Select[Any]:
+    def _accepted_query(self) -> Query:
         """Return the query for the versions that were put in force in the cell or its product.
 
         The query is not run. A product is robot cells that share labels and versions. The rows are
