@@ -95,7 +95,7 @@ class Verbs(click.Group):
 
 @click.group(
     cls=Verbs,
-    context_settings={"help_option_names": ["-h", "--help"]},
+    context_settings={"help_option_names": ["-h", "--help"], "show_default": True},
     epilog=example_epilog("dengine replay --data insertion --reducer conv --repeats 3"),
 )
 @click.version_option(__version__, prog_name="dengine", message="%(prog)s %(version)s")

@@ -203,7 +203,6 @@ def _trace_line(dataset: "Dataset", i: int) -> str:
     "--n",
     type=options.COUNT,
     default=1503,
-    show_default=True,
     help="Number of insertions, of 2 s each.",
 )
 @click.option(

@@ -12,7 +12,7 @@ from .output import Record, format_size, print_result
 
 
 @verb("dengine export engine.db --out model.ts")
-@options.existing_store(click.argument("store", metavar="[STORE]", required=False))
+@options.existing_store(click.argument("store", required=False))
 @click.option(
     "--out", type=FILE, help="The file to write; its checksum is written beside it, as FILE.sha256."
 )

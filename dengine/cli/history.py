@@ -71,7 +71,6 @@ class Moment(click.ParamType):  # type: ignore[type-arg]  # click made it generi
     "--last",
     type=options.COUNT,
     default=50,
-    show_default=True,
     help="How many of the newest decisions are shown.",
 )
 @click.option("--action", type=NameChoice("action"), help="Only decisions with this action.")
@@ -239,7 +238,6 @@ def _event_line(item: StoredVersion | Event) -> str:
     "--neighbours",
     type=click.IntRange(0),
     default=10,
-    show_default=True,
     help="How many of the nearest references are shown.",
 )
 @options.picture_option

@@ -7,7 +7,7 @@ which settings), `DataChoice` (which data set, read how), a store's address, or 
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import closing, suppress
 from dataclasses import dataclass, replace
 from functools import wraps
@@ -233,7 +233,7 @@ def existing_store(store: Option) -> Option:
     return bundle_options("store", _address, {"store": store, "cell_id": cell})
 
 
-store_argument = existing_store(click.argument("store", metavar="STORE"))
+store_argument = existing_store(click.argument("store"))
 
 
 def store_option(text: str, *names: str, required: bool = False) -> Option:
@@ -323,9 +323,9 @@ class RecipeChoice:
 
     def _with_settings(self, recipe: Recipe) -> Recipe:
         """Return a recipe with the settings that were given; SettingError for one out of range."""
-        policy = {name: value for name, value in self.settings.items() if name != "novelty"}
-        recipe = recipe.with_policy(**policy)
-        return recipe.with_settings(novelty=self.settings.get("novelty"))
+        policy = dict(self.settings)
+        novelty = policy.pop("novelty", None)
+        return recipe.with_policy(**policy).with_settings(novelty=novelty)
 
     def make_contender(self) -> Contender:
         """Return the `Contender` that a replay runs: a recipe or a baseline, with its name.
@@ -554,23 +554,23 @@ class DataChoice:
         return data
 
 
-def fault_lines(data: Dataset, most: int) -> list[str]:
-    """Return lines that list the faults of a data set, with the reasons.
+def fault_lines(data: Dataset, most: int) -> Iterator[str]:
+    """Yield lines that list the faults of a data set, with the reasons.
 
     A fault is a recording or file that could not be read as its description says, or a recording
     that repeats another one. The first line counts the faults and all recordings, those without a
     label included. At most `most` faults are named, in their order, and a last line counts the
-    other faults. Without faults the list is empty.
+    other faults. Without faults there is no line.
     """
     n_faults = len(data.faults)
     if not n_faults:
-        return []
+        return
     n_recordings = n_faults + len(data) + data.unlabelled
-    lines = [f"Left out {n_faults} of {n_recordings} recordings of {data.name}:"]
-    lines += [f"- {as_options(str(fault))}" for fault in data.faults[:most]]
+    yield f"Left out {n_faults} of {n_recordings} recordings of {data.name}:"
+    for fault in data.faults[:most]:
+        yield f"- {as_options(str(fault))}"
     if n_faults > most:
-        lines.append(f"- and {n_faults - most} more")
-    return lines
+        yield f"- and {n_faults - most} more"
 
 
 CHOICE = {
@@ -595,9 +595,7 @@ LIVE = {
         metavar="HZ",
         help="Samples per second of live traces.",
     ),
-    "unit": click.option(
-        "--unit", metavar="TEXT", help="Unit of live traces, one for all channels or kN,mm."
-    ),
+    "unit": click.option("--unit", help="Unit of live traces, one for all channels or kN,mm."),
     "fit": click.option(
         "--fit",
         type=NameChoice("fit"),
@@ -608,7 +606,6 @@ TRACE = CHOICE | LIVE
 TRIGGER = {
     "trigger": click.option(
         "--trigger",
-        metavar="TEXT",
         help=(
             "When an insertion begins on a robot: contact=5 (newtons), register@NAME "
             "(not zero), bit=0 (a digital output), motion=0.01 (m/s)."
@@ -689,7 +686,6 @@ def data_options(
                 "description (see `dengine data`); an .npz file with X (traces, samples) and "
                 "y (1 success, 0 failure); or a store's .db."
             ),
-            show_default=True,
             **need,
         )
     more = LIVE | TRIGGER if live else {}
@@ -772,7 +768,6 @@ def n_jobs_option(default: int, text: str) -> Option:
         "--n-jobs",
         type=int,
         default=default,
-        show_default=True,
         callback=lambda _, option, n_jobs: n_jobs or -1,
         help=text,
     )
@@ -855,7 +850,6 @@ seed_option = click.option(
     "--seed",
     type=click.IntRange(0),
     default=0,
-    show_default=True,
     help="An integer; the same seed gives the same run.",
 )
 new_seed_option = click.option(
@@ -865,13 +859,11 @@ check_option = click.option(
     "--check-seconds",
     type=click.FloatRange(0.0, 3600.0, min_open=True),
     default=5.0,
-    show_default=True,
     metavar="S",
     help="How long a verification takes in your cell; every figure of time saved uses it.",
 )
 scenario_option = click.option(
     "--scenario",
     default="nominal",
-    show_default=True,
     help="What changes in the simulated cell: nominal (nothing), wear, variant or bias_jump.",
 )

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from ..decision.certificate import Certificate
 
 Record = dict[str, Any]  # what `--json` prints, by name
+Advance = Callable[[int], None]  # adds a number of steps to those that are done
 SCREEN_WIDTH = 80  # columns where no terminal says otherwise; every table fits them
 LONGEST_NAME = 40  # characters in the first column of a table that is never wrapped
 LINE_SECONDS = 30.0  # between two lines about progress where there is no terminal
@@ -119,10 +120,8 @@ class Out:
         paths = []
         for name, content in contents.items():
             path = self.path / name
-            if isinstance(content, Figure):
-                paths.append(save(content, path, force=self.force))
-            else:
-                paths.append(write_csv(content, path, self.force))
+            write: Any = save if isinstance(content, Figure) else write_csv
+            paths.append(write(content, path, force=self.force))
         return paths
 
 
@@ -166,7 +165,7 @@ def print_result(
     if as_json():
         from ..representation import to_jsonable
 
-        document = {"verb": click.get_current_context().info_name} | dict(record)
+        document: Record = {"verb": click.get_current_context().info_name} | record
         if make_files is not None:
             document["files"] = files
         # `to_jsonable` has turned NaN, which JSON lacks, into None.
@@ -369,7 +368,7 @@ def certificate_record(certificate: "Certificate") -> Record:
 
 
 @contextmanager
-def progress_bar(label: str, total: int | None) -> Iterator[Callable[[int], None]]:
+def progress_bar(label: str, total: int | None) -> Iterator[Advance]:
     """Show a progress bar on stderr while the block runs; it vanishes at the end.
 
     If stderr is no terminal, a thread writes a line every 30 s that says how far the work is. With
@@ -408,7 +407,7 @@ def progress_bar(label: str, total: int | None) -> Iterator[Callable[[int], None
 
 
 @contextmanager
-def _progress_lines(label: str, total: int | None) -> Iterator[Callable[[int], None]]:
+def _progress_lines(label: str, total: int | None) -> Iterator[Advance]:
     """Write a line on the progress to stderr every 30 s (`LINE_SECONDS`) while the block runs.
 
     A thread writes the lines: `label`, the number of steps done of `total` ("?" if it is None or
@@ -443,7 +442,7 @@ class StepInterruptedError(Exception):
 
 
 @contextmanager
-def interruptible_steps(label: str, total: int) -> Iterator[Callable[[int], None]]:
+def interruptible_steps(label: str, total: int) -> Iterator[Advance]:
     """Show a progress bar, and let Ctrl-C or SIGTERM end the work between two steps.
 
     It replaces the handlers of these signals, and of Ctrl-Break on Windows, until the block ends.

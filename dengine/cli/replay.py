@@ -126,7 +126,7 @@ def _end(error: BaseException | None, text: str, is_shown: bool = True) -> None:
 _SHUFFLES = "Number of shuffled replays of each recipe."
 
 
-def stream_options(repeats: int, least: int, n_jobs: int, text: str) -> Callable[[Any], Any]:
+def stream_options(repeats: int, least: int, n_jobs: int, text: str) -> options.Option:
     """Return a decorator that adds the options that say how recorded streams are played.
 
     A stream is the parts of a data set in the order in which an engine gets them. The options are
@@ -159,7 +159,6 @@ def stream_options(repeats: int, least: int, n_jobs: int, text: str) -> Callable
             "--repeats",
             type=click.IntRange(least),
             default=repeats,
-            show_default=True,
             help=text,
         ),
         "seed": options.seed_option,
@@ -231,7 +230,6 @@ def replay(choice: RecipeChoice, **played: Any) -> None:
     "--reducers",
     "names",
     default="conv,umap,pca",
-    show_default=True,
     type=CommaList(NameChoice("method", OWN_RECIPE)),
     help="With commas between; names that are no reducers of dengine are baselines.",
 )
@@ -464,9 +462,7 @@ CURVE_FIELDS = (
 
 
 PRICES = {
-    "check": click.option(
-        "--check", type=float, default=5.0, show_default=True, help="Cost of one verification."
-    ),
+    "check": click.option("--check", type=float, default=5.0, help="Cost of one verification."),
     "escape": click.option(
         "--escape",
         type=float,
@@ -485,9 +481,7 @@ PRICES = {
 )
 @options.data_options()
 @options.bundle_options("part_prices", dict, PRICES)
-@click.option(
-    "--cost-unit", default="s", show_default=True, help="Unit of these costs: s, EUR, ..."
-)
+@click.option("--cost-unit", default="s", help="Unit of these costs: s, EUR, ...")
 @options.recipe_options
 @options.bundle_options("lists", options.drop_none, GRID_LISTS)
 @stream_options(
@@ -566,7 +560,7 @@ def costs(
     verify_all = (name, "-", check, check, "100 %", "-", "-")
     rows = [verify_all, *(_cost_cells(row, row.policy == curve.policy) for row in curve.rows)]
     title = f"{curve.recipe} on {curve.dataset}: what a part costs, in {cost_unit}"
-    lines = _curve_lines(curve, dataset)
+    lines = list(_curve_lines(curve, dataset))
     record: Record = {
         "data": curve.dataset,
         "unit": cost_unit,
@@ -603,8 +597,8 @@ def costs(
     _end(error, "what was finished is shown.")
 
 
-def _curve_lines(curve: CostCurve, dataset: Dataset) -> list[str]:
-    """Return the sentences below the table of what a part costs under each policy.
+def _curve_lines(curve: CostCurve, dataset: Dataset) -> Iterator[str]:
+    """Yield the sentences below the table of what a part costs under each policy.
 
     They say which policy was chosen, and how the choice depends on the three prices (of a check, a
     bad accepted part and a good rejected part). If there are any, they also say how many recordings
@@ -614,16 +608,16 @@ def _curve_lines(curve: CostCurve, dataset: Dataset) -> list[str]:
     from ..experiments.costs import policy_name
     from ..experiments.survey import survey_dataset
 
-    lines = [curve.sentence, curve.price_sentence]
+    yield curve.sentence
+    yield curve.price_sentence
     repeats = survey_dataset(dataset).duplicates
     if repeats:
-        lines.append(f"Of the recordings {repeats:,} repeat another: the interval is too narrow.")
+        yield f"Of the recordings {repeats:,} repeat another: the interval is too narrow."
     by_shuffles = [f"{policy_name(row.policy)} {amount(row.cost)}" for row in curve.left_behind]
     if by_shuffles:
-        lines.append(f"Left behind by the first shuffles: {', '.join(by_shuffles)}.")
+        yield f"Left behind by the first shuffles: {', '.join(by_shuffles)}."
     if curve.out_of_reach:
-        lines.append(f"Not tried: {'; '.join(curve.out_of_reach)}.")
-    return lines
+        yield f"Not tried: {'; '.join(curve.out_of_reach)}."
 
 
 def _as_flags(settings: Options) -> str:

@@ -49,7 +49,6 @@ STRETCHES = 6  # rows of the table
     "kind",
     type=click.Choice(("replay", "simulated", "ur")),
     default="replay",
-    show_default=True,
     help=(
         "replay: the parts of --data, in their order. simulated: physics in MuJoCo. ur: a "
         "Universal Robots controller."
@@ -63,7 +62,6 @@ STRETCHES = 6  # rows of the table
     "--cycles",
     type=options.COUNT,
     default=300,
-    show_default=True,
     help="Number of parts to insert, one in each cycle.",
 )
 @options.store_option("Keeps everything; without a store the run is forgotten.")

@@ -37,14 +37,12 @@ DEMO_DEADLINE = 5.0
 @click.option(
     "--host",
     default="127.0.0.1",
-    show_default=True,
     help="Address to listen on; any other address than this machine's own needs a token.",
 )
 @click.option(
     "--port",
     type=click.IntRange(0, 65535),
     default=8000,
-    show_default=True,
     help="0: any free port.",
 )
 @click.option(
@@ -61,7 +59,6 @@ DEMO_DEADLINE = 5.0
     "--deadline",
     type=click.FloatRange(0.001, 60.0),
     default=0.5,
-    show_default=True,
     metavar="S",
     help="Seconds that a decision may wait in line; after that it is recorded as verify.",
 )
@@ -84,7 +81,6 @@ DEMO_DEADLINE = 5.0
 @click.option(
     "--trigger",
     default="register@output_int_register_25",
-    show_default=True,
     help="When the robot records.",
 )
 @click.option(

@@ -1,5 +1,6 @@
 """The subcommand `dengine status`: how an engine is doing, as far as its store tells."""
 
+from collections.abc import Iterator
 from dataclasses import asdict, fields, replace
 from typing import TYPE_CHECKING, Any
 
@@ -47,7 +48,6 @@ ONLY_WHILE_RUNNING = ("retraining", "store_lag")
     "--last",
     type=options.COUNT,
     default=500,
-    show_default=True,
     help="How many of the newest decisions have a column of their own.",
 )
 @options.check_option
@@ -113,8 +113,8 @@ def _overview_table(store: str, report: "Status") -> Any:
     )
 
 
-def _present_rows(report: "Status") -> list[tuple[str, str]]:
-    """Return rows of a table, (title, text), on the present state of an engine, an alarm first.
+def _present_rows(report: "Status") -> Iterator[tuple[str, str]]:
+    """Yield rows of a table, (title, text), on the present state of an engine, an alarm first.
 
     They are the robot cell; the fields of the status that are not empty, except those that other
     rows or another table show (`SHOWN_ELSEWHERE`) and those that only a running engine knows; the
@@ -126,36 +126,34 @@ def _present_rows(report: "Status") -> list[tuple[str, str]]:
     has no audits (checks of parts of which the model is certain), the counts with the name "audit"
     are called "certain but checked": they come from shadow mode, in which every part is verified.
     """
-    rows = []
     if report.alarm:
-        rows.append(("look at", report.alarm))
-    rows.append(("cell", report.cell))
+        yield "look at", report.alarm
+    yield "cell", report.cell
     shown = report
     if not report.recipe.policy.audit_rate:
         shown = replace(
             report, reasons=_without_audits(report.reasons), sources=_without_audits(report.sources)
         )
-    rows += field_rows(shown, "cell", *SHOWN_ELSEWHERE, *ONLY_WHILE_RUNNING)
+    yield from field_rows(shown, "cell", *SHOWN_ELSEWHERE, *ONLY_WHILE_RUNNING)
     if report.model is None:
         # The recipe has no effect on a model that was handed in.
-        rows += field_rows(report.recipe)
+        yield from field_rows(report.recipe)
     trace_text = "none yet: the first trace sets it"
     if report.trace is not None:
         trace_text = format_value("", report.trace)
         for name in ("rate_hz", "unit"):
             if getattr(report.trace, name) is None:
                 trace_text += f", {heading(name)} unknown"
-    rows.append(("trace", trace_text))
-    rows.append(("accepted", report.certificate.sentence))
-    rows.append(("rejected", report.certificate.sentence_on_rejects))
+    yield "trace", trace_text
+    yield "accepted", report.certificate.sentence
+    yield "rejected", report.certificate.sentence_on_rejects
     retrains = [version.report for version in report.retrains]
     if retrains:
         slowest = max(retrains, key=lambda retrain: retrain.seconds)
-        rows.append(("last retrain", format_value("", retrains[-1])))
-        rows.append(("worst retrain", format_value("", slowest)))
+        yield "last retrain", format_value("", retrains[-1])
+        yield "worst retrain", format_value("", slowest)
     for event in reversed(report.events):
-        rows.append(("newest events", f"{format_time(event.time)} {event.kind}: {event.text}"))
-    return rows
+        yield "newest events", f"{format_time(event.time)} {event.kind}: {event.text}"
 
 
 def _without_audits(counts: dict[str, int]) -> dict[str, int]:

@@ -9,7 +9,7 @@ an exported cell.
 from __future__ import annotations
 
 import getpass
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -51,6 +51,7 @@ interval_option = click.option(
 author_option = click.option(
     "--author",
     default=_login_name,
+    show_default=False,
     help="Who makes the change, for the record.  [default: the login name]",
 )
 
@@ -59,7 +60,7 @@ part_argument = click.argument("part", metavar="PART|ID")
 label_argument = click.argument("label", metavar="good|bad", type=click.Choice(list(LABELS)))
 
 
-def store_options(command: Callable[..., Any]) -> Callable[..., Any]:
+def store_options(command: options.Command) -> options.Command:
     """Add STORE, `--cell`, `--author` and `--allow-import`, for a subcommand that changes an
     engine.
 
@@ -168,7 +169,7 @@ def correct(part: str, label: str, **changing: Any) -> None:
 @verb("dengine forget engine.db import-ad72a2e9751fbf6f-0 --reason 'the fixture was bent'")
 @store_options
 @click.argument("decisions", metavar="ID...", nargs=-1, required=True)
-@click.option("--reason", default="", help="Why, for the record.")
+@click.option("--reason", default="", show_default=False, help="Why, for the record.")
 def forget(decisions: tuple[str, ...], reason: str, **changing: Any) -> None:
     """Leave labels out of everything that is learned and counted.
 
@@ -184,7 +185,7 @@ def forget(decisions: tuple[str, ...], reason: str, **changing: Any) -> None:
 
 @verb("dengine rollback engine.db 1")
 @store_options
-@click.argument("version", metavar="VERSION", type=int)
+@click.argument("version", type=int)
 def rollback(version: int, **changing: Any) -> None:
     """Use an earlier model version again, as a new version.
 
@@ -290,7 +291,7 @@ def retrain(store: str, author: str, allow_import: bool) -> None:
 
 
 @verb("dengine verify engine.db")
-@click.argument("store", metavar="STORE")
+@click.argument("store")
 @click.option("--cell", metavar="ID", help="Check this cell alone.  [default: all cells]")
 @click.option(
     "--expect",
@@ -346,8 +347,8 @@ def verify(
         context.exit(1)
 
 
-def _verification_lines(report: HistoryReport) -> list[str]:
-    """Return the lines that say what a check of a store's history found.
+def _verification_lines(report: HistoryReport) -> Iterator[str]:
+    """Yield the lines that say what a check of a store's history found.
 
     For each robot cell they say how many rows it has, how many entries its ledger (a chain of
     digests over the rows), and the newest digest. They also say if the cell's journal, the file
@@ -355,44 +356,41 @@ def _verification_lines(report: HistoryReport) -> list[str]:
     that the store lacks. Then come the differences that were found (`report.faults`), at most 20,
     how many more there are, and whether everything is as it was written.
     """
-    lines = []
     for cell in report.cells:
-        lines.append(
+        yield (
             f"Cell {cell.cell_id}: {cell.entries:,} entries over {cell.rows:,} rows, newest digest "
             f"{cell.digest or 'none'}"
         )
         if cell.waiting is None:
-            lines.append(
+            yield (
                 f"The journal of cell {cell.cell_id} is not here: its records are not in this "
                 "check, and it does not show if the newest entries were cut off. A copy that "
                 "dengine backup made lacks nothing."
             )
         elif cell.waiting:
-            lines.append(
+            yield (
                 f"The journal of cell {cell.cell_id} holds {cell.waiting:,} records that are not "
                 "in the store yet; its engine, or the next one, moves them there."
             )
     for fault in report.faults[:MOST_FAULTS]:
         cell_text = fault.cell_id and f"cell {fault.cell_id}:"
         where = " ".join(filter(None, (cell_text, fault.table, fault.key)))
-        lines.append(f"{where} {fault.problem}.")
+        yield f"{where} {fault.problem}."
     if len(report.faults) > MOST_FAULTS:
-        lines.append(f"And {len(report.faults) - MOST_FAULTS} more; --json shows all.")
+        yield f"And {len(report.faults) - MOST_FAULTS} more; --json shows all."
     if report.ok:
-        lines.append(
+        yield (
             "Everything is as it was written. Keep the digest elsewhere, and give it to --expect "
             "next time."
         )
     else:
-        lines.append(f"Faults: {len(report.faults)}. This history is not as it was written.")
-    return lines
+        yield f"Faults: {len(report.faults)}. This history is not as it was written."
 
 
 @verb("dengine backup engine.db --out copy.db")
-@click.argument("store", metavar="STORE")
+@click.argument("store")
 @click.option(
     "--out",
-    metavar="FILE",
     required=True,
     type=options.FILE,
     help="The copy; a file that does not exist yet.",
@@ -425,10 +423,9 @@ def backup(store: str, out: Path) -> None:
 
 
 @verb("dengine restore backup.db --store restored.db")
-@click.argument("copy", metavar="COPY")
+@click.argument("copy")
 @click.option(
     "--store",
-    metavar="FILE",
     required=True,
     type=options.FILE,
     help="Where the engine looks for its store; a file that does not exist yet.",
@@ -457,9 +454,7 @@ def restore(copy: str, store: Path) -> None:
 
 
 @verb("dengine import-labels cell.csv --store engine.db")
-@click.argument(
-    "journal", metavar="JOURNAL", type=click.Path(exists=True, dir_okay=False, path_type=Path)
-)
+@click.argument("journal", type=click.Path(exists=True, dir_okay=False, path_type=Path))
 @options.store_option("The store that the cell's model was exported from.", "--cell", required=True)
 @click.option(
     "--any-model",
