@@ -196,7 +196,7 @@ def _add_records(file: Path, cell: str, records: list[Record]) -> None:
             store.apply_records(part)
 
 
-def _fold_wal_and_count(file: Path) -> tuple[int, int]:
+def _fold_wal_and_count(file: Path) -> list[int]:
     """Turn off SQLite's write-ahead log in a store's file, so that everything is in this one file.
 
     Return the numbers of its decisions and labels, over all robot cells. Raise sqlite3.Error if the
@@ -204,8 +204,7 @@ def _fold_wal_and_count(file: Path) -> tuple[int, int]:
     """
     with closing(sqlite3.connect(file)) as connection:
         connection.execute("PRAGMA journal_mode = DELETE")
-        decisions, labels = (
+        return [
             connection.execute(f'SELECT count(*) FROM "{table.name}"').fetchone()[0]
             for table in (DECISION, LABEL)
-        )
-    return decisions, labels
+        ]

@@ -13,7 +13,7 @@ import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import sqlalchemy as sa
 
@@ -28,14 +28,17 @@ from .ledger import (
     newest_entry,
 )
 from .queries import Scope, join_product
-from .records import Clock, EntryName, Row, as_text, chunks
+from .records import Clock, EntryName, Row, T, as_text, chunks
 from .schema import CELL, DECISION, LEDGER, Query, check_schema, lock, prepare_tables
 
-T = TypeVar("T")
-
 # With these, libpq reports a server that has stopped answering after seconds, not hours.
-TIMEOUTS = {"connect_timeout": 5, "tcp_user_timeout": 10000}
-TIMEOUTS |= {"keepalives_idle": 5, "keepalives_interval": 2, "keepalives_count": 3}
+TIMEOUTS = {
+    "connect_timeout": 5,
+    "tcp_user_timeout": 10000,
+    "keepalives_idle": 5,
+    "keepalives_interval": 2,
+    "keepalives_count": 3,
+}
 # Tables that are checked when a store is opened; a damaged trace is noticed as it is read.
 CHECKED_TABLES = ("setting", "correction", "model_version", "label", "decision", "ledger")
 BUSY_SECONDS = 10.0  # wait for another process that writes to the same SQLite file
@@ -266,8 +269,8 @@ def run_integrity_check(connection: sa.Connection, table: str = "") -> list[str]
     raised, and the text of its error is the only finding.
     """
     try:
-        lines = connection.execute(
-            sa.text(f"PRAGMA integrity_check({table})" if table else "PRAGMA integrity_check")
+        lines = connection.exec_driver_sql(
+            f"PRAGMA integrity_check({table})" if table else "PRAGMA integrity_check"
         )
         return [str(line) for line in lines.scalars() if line != "ok"]
     except sa.exc.DatabaseError as error:

@@ -16,6 +16,7 @@ from .records import (
     Change,
     Correction,
     Event,
+    Row,
     from_row,
     new_event,
     nothing_to_correct,
@@ -176,8 +177,13 @@ class CorrectionTable(CellTable):
         (number,) = self._database.insert(connection, EVENT.c.number, [to_row(event)])
         if labels:
             newest = self._scope.next_number(connection, LABEL.c.seq) - 1
-            common = {"event": number, "author": event.author, "time": event.time}
-            common |= {"success": success, "newest_seq": newest}
+            common: Row = {
+                "event": number,
+                "author": event.author,
+                "time": event.time,
+                "success": success,
+                "newest_seq": newest,
+            }
             self._database.insert(
                 connection,
                 CORRECTION.c.number,

@@ -18,8 +18,6 @@ from .queries import (
     SUCCESS,
     TRACE_OF_DECISION,
     WITH_LABELS,
-    n_decisions,
-    past_query,
 )
 from .records import CHUNK, StoredDecision, from_row, read_decision
 from .schema import CORRECTION, DECISION, LABEL, TRACE, Query
@@ -55,7 +53,7 @@ class DecisionTable(CellTable):
             If the trace is missing, or not as it was stored; it is checked only if it is read. Also
             for another stored value that cannot be read, and if the database fails.
         """
-        query = past_query(self._database.cell_id).where(DECISION.c.id == decision_id)
+        query = self._past_query().where(DECISION.c.id == decision_id)
         rows = self._read(
             query.add_columns(*TRACE.c).outerjoin(TRACE, TRACE_OF_DECISION) if trace else query
         )
@@ -83,7 +81,7 @@ class DecisionTable(CellTable):
 
     def newest_number(self) -> int:
         """Return the number of the cell's newest decision; 0 before the first."""
-        return self._read(sa.select(n_decisions(self._database.cell_id)))[0][0] or 0
+        return self._read(sa.select(self._n_decisions()))[0][0] or 0
 
     def select(
         self, where: HistoryFilter, limit: int, start_after: str | None = None, newest: bool = True
@@ -135,7 +133,7 @@ class DecisionTable(CellTable):
             start = query.correlate(None).scalar_subquery()
             conditions.append(number < start if newest else number > start)
         rows = self._read(
-            past_query(self._database.cell_id)
+            self._past_query()
             .where(*conditions)
             .order_by(number.desc() if newest else number)
             .limit(limit)
@@ -184,6 +182,40 @@ class DecisionTable(CellTable):
             for row in self._read(self._unlabelled_query(Action.VERIFY, since_version, *DECISION.c))
         ]
 
+    def _past_query(self) -> Query:
+        """Return the query for the cell's decisions with their corrected labels; it is not run.
+
+        `read_decision` reads its rows: all columns of a decision, and of its label success (None if
+        a person has withdrawn it), source (where it came from), number and time. The source is
+        "stop" (the accepted part was bad and stopped the line) if it was "confirmed" (the part
+        counted as good) and the label was corrected to bad. Decisions without a label are included;
+        traces are not. The rows are in no order.
+        """
+        return (
+            sa.select(
+                *DECISION.c,
+                SUCCESS.label("success"),
+                SOURCE.label("source"),
+                LABEL.c.seq.label("label_seq"),
+                LABEL.c.time.label("label_time"),
+            )
+            .select_from(WITH_LABELS)
+            .where(self._own(DECISION))
+        )
+
+    def _n_decisions(self) -> sa.ScalarSelect[int]:
+        """Return the scalar subquery for the number of the cell's newest decision, NULL if none.
+
+        Decisions are numbered 1, 2, ... in each robot cell, so this is also how many there are. The
+        query is not run.
+        """
+        return (
+            sa.select(sa.func.max(DECISION.c.number))
+            .where(self._own(DECISION))
+            .correlate(None)
+            .scalar_subquery()
+        )
+
     def _unlabelled_query(self, action: Action, since_version: int, *columns: Any) -> Query:
         """Return the query for the cell's decisions of an action that have no label, oldest first.
 
@@ -230,7 +262,7 @@ class DecisionTable(CellTable):
         newest = self._read(
             sa.select(number).where(
                 self._own(DECISION),
-                number == n_decisions(self._database.cell_id),
+                number == self._n_decisions(),
                 DECISION.c.model_version >= since_version,
             )
         )
@@ -270,7 +302,7 @@ class DecisionTable(CellTable):
         StoreError
             For a stored value that cannot be read, and if the database fails.
         """
-        newest = n_decisions(self._database.cell_id)
+        newest = self._n_decisions()
         aged = (sa.false() if within is None else newest - DECISION.c.number >= within).label(
             "aged"
         )

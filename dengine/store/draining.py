@@ -12,18 +12,17 @@ from collections.abc import Callable
 from concurrent.futures import Future
 from contextlib import suppress
 from itertools import islice
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 from ..errors import StoreError, log
 from .journal import Journal
 from .lookup import DecisionIndex
 from .recording import RETRY_SECONDS, Recorder
-from .records import CHUNK, DATA_LOST, LOSS_REMEDY, LabelNumbers
+from .records import CHUNK, DATA_LOST, LOSS_REMEDY, LabelNumbers, T
 
 if TYPE_CHECKING:
     from .sql import SqlStore
 
-T = TypeVar("T")
 DRAIN_SECONDS = 0.25  # synced records wait so long for others before they are drained together
 LAG_SECONDS = 1.0  # a larger lag is a fault of the store
 Call = tuple[Future[Any], Callable[[], Any]]  # what the thread is to call, and its result
@@ -42,7 +41,7 @@ class Drainer:
     index : DecisionIndex
         Records that the database has are removed from it.
     limit : float
-        Seconds that a call waits at most.
+        Seconds that `drain` waits at most.
 
     Attributes
     ----------
@@ -164,7 +163,7 @@ class Drainer:
         Returns
         -------
         Future
-            Of the call's result, for `wait_for_result`.
+            Of the call's result, for `JournalledStore.wait_for_result`.
 
         Raises
         ------

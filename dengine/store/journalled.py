@@ -15,7 +15,7 @@ from concurrent.futures import Future, wait
 from contextlib import suppress
 from dataclasses import replace
 from itertools import islice
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING
 
 from ..errors import NotTakenError, StoreError, log
 from ..records import Arrays, RetrainReport
@@ -24,13 +24,12 @@ from .journal import HEADER
 from .lookup import DecisionIndex
 from .outbox import Outbox
 from .recording import RETRY_SECONDS, Recorder
-from .records import CHUNK, DATA_LOST, LabelNumbers, NewLabel, StoredDecision
+from .records import CHUNK, DATA_LOST, LabelNumbers, NewLabel, StoredDecision, T
 from .views import HistoryFilter
 
 if TYPE_CHECKING:
     from .sql import SqlStore
 
-T = TypeVar("T")
 NO_LIMIT = 1e9  # seconds: never reached
 # Opening waits so long for SQLite's check; that of a large store goes on beside.
 CHECK_SECONDS = 0.1
@@ -349,7 +348,7 @@ class JournalledStore(Outbox):
 
         Before the call, the thread copies the records that are on disk to the database. Raise what
         the call raises, and StoreError if the store has a fault (the call is then not made) or
-        takes longer than `limit` seconds (`Drainer.wait_for_result`).
+        takes longer than `limit` seconds (`wait_for_result`).
         """
         return self.wait_for_result(self._drainer.submit(call))
 

@@ -275,8 +275,8 @@ class LedgerEntry:
     connection : sqlalchemy.Connection
         Of the transaction. The cell's newest entry is read from it.
     cell_id : str
-    key : bytes, default b""
-        Key of a keyed ledger.
+    key : bytes
+        Key of a keyed ledger; b"" for a ledger without a key.
 
     Attributes
     ----------

@@ -9,7 +9,7 @@ import math
 from collections.abc import Iterable
 from concurrent.futures import Future
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 from ..records import Arrays, RetrainReport
 from .journal import Record
@@ -19,7 +19,6 @@ from .records import NewLabel, StoredDecision, check_state, chunks, new_event
 if TYPE_CHECKING:
     from .sql import SqlStore
 
-T = TypeVar("T")
 MAX_UNWRITTEN_VERSIONS = 40  # about 1.5 MB each
 
 
@@ -33,7 +32,7 @@ class MemoryStore(Outbox):
     store : SqlStore
     window : int
         Number of newest labels whose integrity is checked.
-    reading : bool, default False
+    reading : bool
         The engine only reads.
     """
 

@@ -12,17 +12,15 @@ from collections.abc import Callable, Iterable
 from concurrent.futures import Future
 from contextlib import suppress
 from dataclasses import replace
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING
 
 from ..errors import StoreError, log
 from ..records import Arrays, RetrainReport
 from .journal import forked_error
-from .records import LabelNumbers, NewLabel, StoredDecision
+from .records import LabelNumbers, NewLabel, StoredDecision, T
 
 if TYPE_CHECKING:
     from .sql import SqlStore
-
-T = TypeVar("T")
 
 
 class Outbox(ABC):

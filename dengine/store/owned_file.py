@@ -72,7 +72,7 @@ class OwnedFile:
     ----------
     path : Path
         A symbolic link is refused.
-    owning : bool, default True
+    owning : bool
         Lock the file, and open it for writing. False: only read it, whoever owns it; it must exist.
 
     Raises

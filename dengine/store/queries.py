@@ -244,39 +244,3 @@ SOURCE: sa.ColumnElement[str | None] = sa.case(
     ),
     else_=LABEL.c.source,
 )
-
-
-def past_query(cell_id: str) -> Query:
-    """Return the query for a cell's decisions with their corrected labels; it is not run.
-
-    `read_decision` reads its rows: all columns of a decision, and of its label success (None if a
-    person has withdrawn it), source (where it came from), number (that of its row) and time. The
-    source is "stop" (the accepted part was bad and stopped the line) if it was "confirmed" (the
-    part counted as good) and the label was corrected to bad. Decisions without a label are
-    included; traces are not. The rows are in no order.
-    """
-    return (
-        sa.select(
-            *DECISION.c,
-            SUCCESS.label("success"),
-            SOURCE.label("source"),
-            LABEL.c.seq.label("label_seq"),
-            LABEL.c.time.label("label_time"),
-        )
-        .select_from(WITH_LABELS)
-        .where(DECISION.c.cell_id == cell_id)
-    )
-
-
-def n_decisions(cell_id: str) -> sa.ScalarSelect[int]:
-    """Return the scalar subquery for the number of a cell's newest decision, NULL if none.
-
-    Decisions are numbered 1, 2, ... in each robot cell, so this is also how many there are. The
-    query is not run.
-    """
-    return (
-        sa.select(sa.func.max(DECISION.c.number))
-        .where(DECISION.c.cell_id == cell_id)
-        .correlate(None)
-        .scalar_subquery()
-    )

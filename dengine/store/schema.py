@@ -236,7 +236,7 @@ def _add_columns(connection: sa.Connection) -> None:
         names = _stored_columns(connection, table)
         if names >= {"cell_id", "sum"} and column.name not in names:
             type_ = column.type.compile(connection.dialect)
-            connection.execute(sa.text(f'ALTER TABLE "{table}" ADD COLUMN "{column.name}" {type_}'))
+            connection.exec_driver_sql(f'ALTER TABLE "{table}" ADD COLUMN "{column.name}" {type_}')
 
 
 def check_schema(connection: sa.Connection, name: str) -> None:

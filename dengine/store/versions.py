@@ -43,6 +43,8 @@ class VersionTable(CellTable):
         super().__init__(database)
         self._events = events
         self._keep = keep
+        # The rows of the cell, or of all cells of its product.
+        self._shared = self._scope.shared(VERSION.c.cell_id)
 
     def put(
         self,
@@ -132,9 +134,7 @@ class VersionTable(CellTable):
                 if not keeps_state(stored.version, number, self._keep)
             ]
             if dropped:
-                update = sa.update(VERSION).where(
-                    self._scope.shared(VERSION.c.cell_id), VERSION.c.retrain.in_(dropped)
-                )
+                update = sa.update(VERSION).where(self._shared, VERSION.c.retrain.in_(dropped))
                 connection.execute(update.values(state=None))
         # Afterwards, so that the new state takes the room of those.
         self._database.insert(connection, VERSION.c.retrain, [row | {"version": number}])
@@ -222,7 +222,7 @@ class VersionTable(CellTable):
         or damaged.
         """
         query = sa.select(*VERSION.c["cell_id", "version", "last_seq", "state", "state_sum"]).where(
-            self._scope.shared(VERSION.c.cell_id), VERSION.c.retrain == retrain
+            self._shared, VERSION.c.retrain == retrain
         )
         row = self._read(query)[0]
         if row.state is None or state_sum(row.state) != row.state_sum:
@@ -287,6 +287,6 @@ class VersionTable(CellTable):
         """
         return (
             sa.select(*VERSION.c["retrain", "version"], VERSION.c.state.is_not(None).label("kept"))
-            .where(self._scope.shared(VERSION.c.cell_id), VERSION.c.accepted == sa.true())
+            .where(self._shared, VERSION.c.accepted == sa.true())
             .order_by(VERSION.c.retrain.desc())
         )
