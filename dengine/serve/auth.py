@@ -53,11 +53,12 @@ class Token:
     name: str = ""
 
 
+Tokens = tuple[Token, ...]
 ANYBODY = Token()  # of requests to a server that needs no token
 CURRENT_TOKEN = ContextVar("CURRENT_TOKEN", default=ANYBODY)  # of the request being answered
 
 
-def read_tokens(file: Path) -> tuple[Token, ...]:
+def read_tokens(file: Path) -> Tokens:
     """Read tokens from a file that only its owner may use, in the order of its lines.
 
     A token authorizes requests. Each line is a secret, optionally followed by `viewer` (who may
@@ -164,7 +165,7 @@ def names_this_machine(host: str) -> bool:
         return False
 
 
-def find_token(tokens: tuple[Token, ...], secret: str) -> Token | None:
+def find_token(tokens: Tokens, secret: str) -> Token | None:
     """Return the token with this secret; None if there is none, also if `tokens` is empty.
 
     All tokens are compared, in constant time.
@@ -192,7 +193,7 @@ def take_token(scope: Scope, authorization: str) -> str:
     """
     if scope["path"].startswith(f"{RPC}/"):
         secret = str(scope["path"]).removeprefix(f"{RPC}/")
-        scope.update(path=RPC, raw_path=RPC.encode("ascii"))
+        scope.update(path=RPC, raw_path=RPC.encode())
         return secret
     scheme, _, value = authorization.partition(" ")
     if scheme.lower() == "bearer":
@@ -200,7 +201,7 @@ def take_token(scope: Scope, authorization: str) -> str:
     if scheme.lower() != "basic":
         return ""
     try:
-        return base64.b64decode(value.strip(), validate=True).decode("utf-8").partition(":")[2]
+        return base64.b64decode(value.strip(), validate=True).decode().partition(":")[2]
     except ValueError:  # also binascii.Error and UnicodeDecodeError
         return ""
 
@@ -237,7 +238,7 @@ class Guard:
         server localhost, or by a loopback address.
     """
 
-    def __init__(self, app: ASGIApp, tokens: tuple[Token, ...]) -> None:
+    def __init__(self, app: ASGIApp, tokens: Tokens) -> None:
         self.app = app
         self.tokens = tokens
 

@@ -29,7 +29,7 @@ from asyncua.ua import VariantType
 from asyncua.ua.status_codes import StatusCodes
 
 from ..errors import DengineError, SettingError, TraceError, as_options, log
-from .auth import Token, check_key_pair, find_token, host_in_url, is_loopback
+from .auth import Tokens, check_key_pair, find_token, host_in_url, is_loopback
 from .robot_calls import RobotCalls, one_line
 from .service import CellService
 
@@ -77,7 +77,7 @@ class TokenUsers(UserManager):
         accept a session on it.
     """
 
-    def __init__(self, tokens: tuple[Token, ...], encrypted: bool) -> None:
+    def __init__(self, tokens: Tokens, encrypted: bool) -> None:
         self._tokens = tokens
         self._encrypted = encrypted
 
@@ -110,7 +110,7 @@ async def opcua_server(
     service: CellService,
     port: int,
     host: str = "127.0.0.1",
-    tokens: tuple[Token, ...] = (),
+    tokens: Tokens = (),
     cert: Path | None = None,
     key: Path | None = None,
 ) -> AsyncIterator[Server]:

@@ -137,7 +137,7 @@ def _drive(mujoco: Any, model: Any, data: Any, conditions: Conditions, steps: in
     return force
 
 
-def cell_xml(c: Conditions, time_step_s: float = TIME_STEP_S) -> str:
+def cell_xml(c: Conditions, time_step_s: float) -> str:
     """Return the MuJoCo model of the whole robot cell under the conditions `c`, as XML (MJCF).
 
     It has the fixture, the carriage, which a drive moves up and down, the elastic wrist with the
@@ -228,8 +228,10 @@ def _fixture_xml(c: Conditions) -> str:
     depth = DEPTH_MM / 1000
     chamfer = c.chamfer_mm / 1000
     chip = c.debris_mm / 2000
-    parts = [_wall_xml(side, half, chamfer, depth) for side in range(4)]
-    parts.append(f'<geom type="box" size="0.03 0.03 0.005" pos="0 0 {-depth - 0.005}"/>')
+    parts = [
+        *(_wall_xml(side, half, chamfer, depth) for side in range(4)),
+        f'<geom type="box" size="0.03 0.03 0.005" pos="0 0 {-depth - 0.005}"/>',
+    ]
     if c.debris_mm > 0:
         position = f"{c.debris_x_mm / 1000} {c.debris_y_mm / 1000} {-depth + chip}"
         parts.append(

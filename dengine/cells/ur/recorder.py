@@ -116,6 +116,14 @@ class RtdeRecorder(AbstractContextManager["RtdeRecorder"]):
         connect = partial(RtdeClient, host, port, values, inputs, rate_hz, timeout)
         self.stream = RtdeStream(connect, rate_hz)
         self._step = self.stream.step
+        self._reset()
+
+    def _reset(self) -> None:
+        """Discard the recorder's packages and the start of an insertion; look for the next.
+
+        Packages that the stream has buffered stay. A trigger that is on begins nothing until it was
+        off.
+        """
         self._finder = StartFinder(self._step, self.trigger.quiet_s)
         self._rows: list[Row] = []
         self._start: Start | None = None
@@ -245,13 +253,3 @@ class RtdeRecorder(AbstractContextManager["RtdeRecorder"]):
         NaN before an insertion begins.
         """
         return float("nan") if self._start is None else self._start.time - self._before * self._step
-
-    def _reset(self) -> None:
-        """Discard the recorder's packages and the start of an insertion; look for the next.
-
-        Packages that the stream has buffered stay. A trigger that is on begins nothing until it was
-        off.
-        """
-        self._finder = StartFinder(self._step, self.trigger.quiet_s)
-        self._rows = []
-        self._start = None

@@ -18,7 +18,6 @@ from itertools import chain
 from ...errors import CellError, SettingError, expect, instead
 from .protocol import (
     CHANNELS,
-    PORT,
     VERSION,
     HeldError,
     Package,
@@ -37,7 +36,8 @@ class RtdeClient:
     Parameters
     ----------
     host : str
-    port : int, default 30004
+    port : int
+        Of RTDE, 30004 on a robot.
     columns : sequence of str
         Values to receive beside `timestamp`, for example `actual_TCP_force[2]`. Of a vector all
         elements come.
@@ -62,7 +62,7 @@ class RtdeClient:
     def __init__(
         self,
         host: str,
-        port: int = PORT,
+        port: int,
         columns: Sequence[str] = (),
         inputs: Sequence[str] = (),
         rate_hz: float = 500.0,
