@@ -120,15 +120,13 @@ def export(
             "bytes": n_bytes,
             "signed": key is not None,
         }
-        lines.append(
+        lines += [
             f"Wrote {out} ({format_size(n_bytes)}) and {out.name}.sha256: version {version} with "
-            f"{n_references} labelled references."
-        )
-        lines.append(
+            f"{n_references} labelled references.",
             "Loading such a file runs the code in it: load only your own files, or sign them with "
             "--key."
             if key is None
             else f"Signed with {key}: {out.name}.sig. Give the key to whoever loads the file, and "
-            "the signature is checked before loading."
-        )
+            "the signature is checked before loading.",
+        ]
     print_result(record, *lines)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import closing, suppress
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import wraps
 from importlib.util import find_spec
@@ -313,7 +313,7 @@ class RecipeChoice:
         recipe = self.make_contender().recipe
         texts: Mapping[str, str] = {}
         if store:
-            with suppress(StoreError), closing(open_store(store, must_exist=True)) as opened:
+            with suppress(StoreError), open_store(store, must_exist=True) as opened:
                 texts = opened.settings.read()
         if "recipe" in texts:
             stored = Recipe.from_store(texts)

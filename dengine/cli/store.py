@@ -94,10 +94,12 @@ def _change_and_print(
     event = ""
     if changed.event is not None:
         event = f" Event {changed.event}, by {author or 'nobody named'}."
-    record = {"store": store, "author": author, "changed": changed.event is not None}
-    record |= asdict(changed)
-    record |= {"policy": policy, "certificate": certificate_record(certificate)}
-    print_result(record, f"{changed.text}{event}")
+    print_result(
+        {"store": store, "author": author, "changed": changed.event is not None}
+        | asdict(changed)
+        | {"policy": policy, "certificate": certificate_record(certificate)},
+        f"{changed.text}{event}",
+    )
 
 
 @verb("dengine report engine.db import-d684ff7e4dbab839-0 bad")
@@ -410,16 +412,17 @@ def backup(store: str, out: Path) -> None:
     from ..store.backup import backup_store
 
     report = backup_store(store, out)
-    lines = [
-        f"{out}: {report.decisions:,} decisions and {report.labels:,} labels; "
-        f"{report.from_journals:,} records came from journals that lie beside the store."
-    ]
-    lines += [
+    without_journal = [
         f"No journal of cell {cell} lies beside {store}: its records, if any, are not in the copy."
         for cell in report.without_journal
     ]
-    lines.append(f"Check it: dengine verify {out}")
-    print_result({"store": store, "out": out} | asdict(report), *lines)
+    print_result(
+        {"store": store, "out": out} | asdict(report),
+        f"{out}: {report.decisions:,} decisions and {report.labels:,} labels; "
+        f"{report.from_journals:,} records came from journals that lie beside the store.",
+        *without_journal,
+        f"Check it: dengine verify {out}",
+    )
 
 
 @verb("dengine restore backup.db --store restored.db")
