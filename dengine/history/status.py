@@ -407,6 +407,7 @@ def status(store: SqlStore, last: int = NEWEST, watching: bool = False) -> Statu
     losses = [event.text for event in open_losses(events)]
     modes = (SAFE_MODE_BEGAN, SAFE_MODE_ENDED)
     mode = next((event for event in reversed(events) if event.kind in modes), None)
+    began = mode if mode is not None and mode.kind == SAFE_MODE_BEGAN else None
     retrains = store.versions.all(cell_only=True)
     last_seq = retrains[-1].last_seq if retrains else 0
     accepted = [report for report in store.versions.retrains() if report.accepted]
@@ -422,7 +423,7 @@ def status(store: SqlStore, last: int = NEWEST, watching: bool = False) -> Statu
         version=accepted[-1].version if accepted else 0,
         pinned=_read_pinned(store, accepted),
         shadow=policy.shadow,
-        safe_mode=mode.text if mode is not None and mode.kind == SAFE_MODE_BEGAN else "",
+        safe_mode="" if began is None else began.text,
         safe_mode_time=None if mode is None else mode.time,
         new_labels=sum(not label.quarantined for label in store.labels.past(last_seq)),
         last=last,
@@ -432,7 +433,7 @@ def status(store: SqlStore, last: int = NEWEST, watching: bool = False) -> Statu
         certificate=policy.certificate(in_force.outcomes),
         retrains=tuple(retrains),
         events=tuple(events[-N_EVENTS:]),
-        watch=read_watch(store, recipe, mode) if watching else None,
+        watch=read_watch(store, recipe, began) if watching else None,
         loss=" ".join(["Data was lost:", *losses, LOSS_REMEDY]) if losses else "",
         **{name: counts[name] for name in COUNTED},
     )
@@ -595,7 +596,7 @@ def bad_accepts(outcomes: Outcomes, policy: Policy) -> ErrorEstimate:
     return replace(audited, lower=lower, upper=upper, verdict=_verdict(lower, upper, tolerance))
 
 
-def read_watch(store: SqlStore, recipe: Recipe, mode: Event | None) -> Watch | None:
+def read_watch(store: SqlStore, recipe: Recipe, began: Event | None) -> Watch | None:
     """Return how close the drift detectors are to an alarm, and a safe mode to its end.
 
     A drift detector is a running test for more wrong decisions than allowed (`accepts`, `rejects`),
@@ -609,9 +610,10 @@ def read_watch(store: SqlStore, recipe: Recipe, mode: Event | None) -> Watch | N
     evidence, for how many of these accepting (rejecting, after an alarm about rejected parts) would
     have been wrong, and after about how many more parts the safe mode ends; or that the evidence is
     enough, or that the safe mode does not end, if it would take more than 10,000 more parts. It is
-    "" outside safe mode. `mode` is the newest event at which a safe mode began or ended; without it
-    `recovery` is "". Raises what `load_rule` and a user's rule raise, and may write an event to the
-    store as `load_rule` does.
+    "" outside safe mode. `began` is the event at which the safe mode began; without it `recovery`
+    is "". The rule can be in a safe mode of which there is no event yet, or never will be, because
+    the engine was killed in between. Raises what `load_rule` and a user's rule raise, and may write
+    an event to the store as `load_rule` does.
     """
     from ..decision.member_rules import MemberRule  # torch
     from .past_versions import load_rule
@@ -625,11 +627,11 @@ def read_watch(store: SqlStore, recipe: Recipe, mode: Event | None) -> Watch | N
     evidence = rule.evidence
     safe_mode = rule.safe_mode()
     recovery = ""
-    if safe_mode and mode is not None:
+    if safe_mode and began is not None:
         side = (safe_mode - 1) % 2
         n, n_wrong = evidence.member_counts_since_alarm[side].sum(0).tolist()
         # With the part that raised the alarm.
-        n_parts = 1 + len(store.decisions.select(HistoryFilter(since=mode.time), MAX_SINCE_ALARM))
+        n_parts = 1 + len(store.decisions.select(HistoryFilter(since=began.time), MAX_SINCE_ALARM))
         n_more = evidence.members_to_recovery(side) * n_parts / (n + 1)
         end = f"if this goes on, safe mode ends after about {n_more:.0f} more parts"
         if n_more <= 0.0:

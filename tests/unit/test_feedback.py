@@ -199,6 +199,17 @@ def test_safe_mode_begins_with_a_recorded_reason_and_a_call_and_ends_when_fresh_
     assert engine.status(watching=True).watch.recovery == ""
 
 
+def test_of_a_safe_mode_whose_beginning_is_not_recorded_no_recovery_is_told(stream):
+    engine = make(replace(LOCAL, stops="all"))
+    play(engine, stream, 0, 200)
+    play(engine, spoiled(stream))
+    assert engine.status(watching=True).watch.recovery
+    # As if the earlier safe mode had ended, and the engine was killed as this one began.
+    engine._outbox.record_event("safe mode ended", "")
+    assert engine.safe_mode
+    assert engine.status(watching=True).watch.recovery == ""
+
+
 def test_a_parts_hash_never_changes():
     fnv = {"": 0xCBF29CE484222325, "a": 0xAF63DC4C8601EC8C, "foobar": 0x85944171F73967E8}
     for text, expected in fnv.items():  # FNV-1a: the vectors of its authors' reference
