@@ -45,7 +45,7 @@ from .bundle import (
     write_export,
 )
 from .decision import FIELDS
-from .torchscript import TOLERANCE, ExportedDecision, golden_trace
+from .torchscript import TOLERANCE, ExportedDecision, golden_answer, golden_trace
 
 NEEDED = ("onnx", "onnxruntime", "onnxscript")
 FAR = 1e9  # a coordinate that no radius reaches
@@ -125,8 +125,8 @@ def export_onnx(
     onnx_model = OnnxModel(program.SerializeToString(), metadata)
     _check_decisions(onnx_model, source.model, source.trace)
     x = golden_trace(source.trace)
-    golden = {"trace": x.tolist(), "embedding": onnx_model.decide(x).embedding.tolist()}
-    onnx.helper.set_model_props(program, {METADATA: json.dumps(metadata | {"golden": golden})})
+    metadata["golden"] = golden_answer(x, onnx_model.decide(x).embedding)
+    onnx.helper.set_model_props(program, {METADATA: json.dumps(metadata)})
     return write_export(path, program.SerializeToString(), force, key, source)
 
 

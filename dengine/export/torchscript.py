@@ -43,7 +43,7 @@ from ..records import (
     TraceSpec,
     as_success,
 )
-from ..traces import as_trace
+from ..traces import LARGEST, as_trace
 from .bundle import (
     METADATA,
     Metadata,
@@ -146,9 +146,8 @@ def export_torchscript(
     with torch.inference_mode():
         # A copy decides, or the golden trace would be the pending decision of the file.
         embedding = copy.deepcopy(compiled).decide(torch.from_numpy(x))[6]
-    golden = {"trace": x.tolist(), "embedding": embedding.tolist()}
-    content = _content(compiled, describe(source) | {"golden": golden})
-    return write_export(path, content, force, key, source)
+    metadata = describe(source) | {"golden": golden_answer(x, embedding.numpy())}
+    return write_export(path, _content(compiled, metadata), force, key, source)
 
 
 def _content(module: Any, metadata: Metadata) -> bytes:
@@ -165,11 +164,28 @@ def golden_trace(spec: TraceSpec) -> TraceArray:
     """Return the trace, float32 (C, T), on which a loader checks the embedding of its machine.
 
     It is a sine that runs on from channel to channel, always the same for the same `spec`. Its
-    amplitude is half of the sensor's limit, or 1 without a limit.
+    amplitude is half of the sensor's limit, or 1 without a limit or if half of it is too large for
+    a sample (`LARGEST`). Of a single sample, or a limit that float32 has no half of, it is faulty.
     """
-    n = spec.channels * spec.samples
-    x = np.sin(np.arange(n, dtype=np.float32) / 7.0).reshape(spec.channels, spec.samples)
-    return np.asarray(x if spec.limit is None else x * np.float32(0.5 * spec.limit))
+    amplitude = 1.0
+    if spec.limit is not None and spec.limit <= 2.0 * LARGEST:
+        amplitude = 0.5 * spec.limit
+    x = np.sin(np.arange(spec.channels * spec.samples, dtype=np.float32) / 7.0)
+    return (x * np.float32(amplitude)).reshape(spec.channels, spec.samples)
+
+
+def golden_answer(trace: TraceArray, embedding: NDArray[np.float32]) -> dict[str, Any]:
+    """Return the golden trace with its embedding (K, d), as a dict for JSON.
+
+    Raises ExportError if the embedding is not finite, because no loader could compare it.
+    """
+    if not np.isfinite(embedding).all():
+        raise ExportError(
+            f"The embedding of a test trace, a sine of {trace.shape[0]} x {trace.shape[1]} samples "
+            "below the limit, is not finite, so no machine could check the file; give traces two "
+            "or more samples, and a limit that they can stay below."
+        )
+    return {"trace": trace.tolist(), "embedding": embedding.tolist()}
 
 
 class ExportedDecision(NamedTuple):

@@ -274,6 +274,20 @@ def test_what_cannot_be_exported_says_why_and_names_the_alternative(data, tmp_pa
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize("limit", [1e19, float("inf")])
+def test_a_file_for_a_sensor_without_a_real_limit_is_checked_and_loaded(data, tmp_path, limit):
+    spec = TraceSpec(SAMPLES, limit=limit)
+    exported = load_exported(export_torchscript(fitted(data), tmp_path / "model.ts", trace=spec))
+    assert np.isfinite(exported.metadata["golden"]["embedding"]).all()
+
+
+def test_a_file_that_no_machine_could_check_is_not_written(data, tmp_path):
+    spec = TraceSpec(SAMPLES, limit=1e-60)
+    with pytest.raises(ExportError, match="is not finite, so no machine could check the file"):
+        export_torchscript(fitted(data), tmp_path / "model.ts", trace=spec)
+    assert list(tmp_path.iterdir()) == []
+
+
 def buffers(exported: ExportedModel) -> dict[str, torch.Tensor]:
     """What a file has learned, by the last two words of its name."""
     return {".".join(name.split(".")[-2:]): t for name, t in exported.module.named_buffers()}
