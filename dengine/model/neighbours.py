@@ -68,8 +68,8 @@ from .base import (
 )
 
 NEWEST = 500  # traces that are searched for repeats: the work does not grow
-NEIGHBOURS = 10
-# A nearest neighbour within this share of the distance to the tenth one is a near repeat; of
+NEIGHBOURS = 10  # nearest ones before the one that a near repeat is measured by
+# A nearest neighbour within this share of the distance to the eleventh is a near repeat; of
 # distinct parts about one in two hundred is as near.
 NEAR = 0.12
 # More near repeats are reported; among 100 to 500 insertions of distinct parts there were up to 15.
@@ -1011,8 +1011,8 @@ def near_repeats(traces: Floats, parts: NDArray[np.int64]) -> int:
     distances[parts[:, None] == parts] = np.inf
     nearest = distances.min(1)
     # A quarter of the time of `kthvalue`.
-    tenth = np.partition(distances, NEIGHBOURS)[:, NEIGHBOURS]
-    return int(((nearest < NEAR * tenth) & (tenth > 1e-6)).sum())
+    eleventh = np.partition(distances, NEIGHBOURS)[:, NEIGHBOURS]
+    return int(((nearest < NEAR * eleventh) & (eleventh > 1e-6)).sum())
 
 
 def repeats_note(traces: Floats, parts: NDArray[np.int64]) -> str:
