@@ -753,9 +753,9 @@ def trace_spec_from(options: Options) -> TraceSpec | None:
             "Live traces need --samples too; without these options the first trace sets all."
         )
     # `--channels 3` is a number of channels, not the name of one.
-    n_channels = int(names[0]) if len(names) == 1 and names[0].isdecimal() else len(names) or 1
-    columns = names if names != (str(n_channels),) else ()
-    return TraceSpec(**settings, channels=n_channels, columns=columns)
+    if len(names) == 1 and names[0].isdecimal():
+        return TraceSpec(**settings, channels=int(names[0]))
+    return TraceSpec(**settings, channels=len(names) or 1, columns=names)
 
 
 def n_jobs_option(default: int, text: str) -> Option:

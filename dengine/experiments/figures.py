@@ -569,7 +569,7 @@ def data_picture(data: Dataset, title: str = "") -> Figure:
     figure = blank(9.0, 7.6)
     above, below = figure.subfigures(2, 1, squeeze=False, height_ratios=(1, 1.1))[:, 0]
     labels = _axis_labels(data.spec)
-    above.suptitle(f"{title}: median trace, and where 10 to 90 % of them lie")
+    above.suptitle(f"{title}: median trace, and where 10 to 90 % of them lie".removeprefix(": "))
     x, x_label = _times(data.spec, X.shape[2])
     for i, axes in enumerate(above.subplots(1, min(X.shape[1], 3), squeeze=False)[0]):
         for success, name, colour, line, _ in LABEL_STYLES:

@@ -336,8 +336,8 @@ class DecisionModule(nn.Module):
         dimensions.
         """
         x = trace.unsqueeze(0) if trace.dim() == 1 else trace
-        fits = x.numel() > 0 and can_fit_length(x.size(-1), self.samples, self.fit)
-        if x.dim() != 2 or x.size(0) != self.channels or not fits:
+        is_whole = x.dim() == 2 and x.size(0) == self.channels and x.numel() > 0
+        if not is_whole or not can_fit_length(x.size(-1), self.samples, self.fit):
             raise ValueError(
                 f"Expected one trace of {self.channels} x {self.samples} samples, got shape "
                 f"{trace.size()}."

@@ -181,7 +181,7 @@ def _refuse_unsupported(source: Exportable) -> None:
     rule = type(source.model.rule)  # a user's own as well: `OnnxDecision` knows the paper's alone
     n_repeats = int(source.model.index.repeats)
     needed = {
-        "audits (set audit_rate = 0)": source.audit_rate > 0.0,
+        "audits or shadow mode (set audit_rate = 0, shadow = false)": source.audit_rate > 0.0,
         f"{rule.__name__}, a rule that learns (set guarantee = 'local' and stops = 'some')": (
             rule is not DecisionRule
         ),

@@ -664,9 +664,11 @@ def forked_error(pid: int, name: str) -> StoreError:
 def describe_process() -> str:
     """Return this process's number and host in words, "process N on HOST".
 
-    It is stored, so that another process that finds the robot cell owned can name its owner.
+    It is stored, so that another process that finds the robot cell owned can name its owner. A
+    letter beyond ASCII becomes `?`.
     """
-    return f"process {os.getpid()} on {socket.gethostname()}"
+    host = socket.gethostname().encode("ascii", "replace").decode()  # a header has no more room
+    return f"process {os.getpid()} on {host}"
 
 
 def owned_error(owner: str, name: str) -> StoreError:

@@ -60,9 +60,9 @@ class OwnRule(DecisionRule):
 
 
 EVERYTHING = (
-    "ONNX carries no audits (set audit_rate = 0); nor PooledRule, a rule that learns (set "
-    "guarantee = 'local' and stops = 'some'); nor an operator's force limits. Export "
-    "torchscript instead."
+    "ONNX carries no audits or shadow mode (set audit_rate = 0, shadow = false); nor PooledRule, a "
+    "rule that learns (set guarantee = 'local' and stops = 'some'); nor an operator's force limits."
+    " Export torchscript instead."
 )
 
 

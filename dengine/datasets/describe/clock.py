@@ -82,8 +82,9 @@ def propose_clock(p: Proposal) -> None:
         names = [
             c.name for c in p.unused if is_counter(c) or (NAME.search(c.name) and c.usual_step)
         ]
-        if "c0" in p.description.text.names or "s" in p.columns:  # no names; s may be the stroke
-            names = [*p.columns]
+        unused = [c.name for c in p.unused]
+        if "c0" in p.description.text.names or "s" in unused:  # no names; s may be the stroke
+            names = unused
     if clocks and (is_stated or len(names) == 1):
         p.put("time.column", [column.name for column in clocks])
         p.put("time.format", [form_of(column, p) for column in clocks])
