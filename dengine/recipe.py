@@ -89,8 +89,8 @@ class ReducerDefault:
 def _check_integer(name: str, value: Any) -> None:
     """Raise SettingError for a value that the integer setting `name` of a recipe cannot have.
 
-    It must be an integer, not a boolean, in the range that `INTEGER_RANGES` has for the name, both
-    ends included.
+    A recipe is all settings of an engine. The value must be an integer, not a boolean, in the range
+    that `INTEGER_RANGES` has for the name, both ends included.
     """
     least, most = INTEGER_RANGES[name]
     expect(
@@ -285,11 +285,12 @@ class Recipe:
         """Parse the recipe in the settings of a store, ``settings["recipe"]``, and return it.
 
         A recipe holds every setting of an engine. `settings` has texts by name. No class of a
-        reducer is imported. The defaults of `radius` and `retrain_every` are attributes of the
-        reducer's class, so the stored recipe must have both, unless the reducer is a name in
-        `RECIPES`: else StoreError is raised, because the store is damaged. Raises SettingError for
-        a text that is no recipe, and KeyError if the settings have no recipe. `where` is the
-        recipe's name in errors.
+        reducer (a transformer from traces to points) is imported. The defaults of the settings
+        `radius` and `retrain_every` are attributes of the reducer's class, so the stored recipe
+        must have both, unless the reducer is a name in `RECIPES`, the recipes of dengine itself:
+        else StoreError is raised, because the store is damaged. Raises SettingError for a text that
+        is no recipe, and KeyError if the settings have no recipe. `where` is the recipe's name in
+        errors.
         """
         recipe = cls.from_toml(settings["recipe"], where)
         missing = [name for name in ("radius", "retrain_every") if vars(recipe)[name] is None]
@@ -301,16 +302,16 @@ class Recipe:
         return recipe
 
     def to_toml(self) -> str:
-        """Return the recipe as TOML, in which None is written as "none".
+        """Return the recipe, every setting of an engine, as TOML; None is written as "none".
 
-        If `radius` or `retrain_every` is None, the reducer's class is imported, and its default is
-        written. For a reducer given by name the recipe's `params` are written, and no defaults. A
-        reducer object is written as `module:Class` with its parameters that are not None. If a
-        parameter is no text, number or boolean, like the steps of a pipeline, if it is the text
-        "none", or if it is None although its default is not, or if the class is local or stands in
-        `__main__`, the object is written as "object Class", and the user must hand it in again.
-        Raises SettingError if the class of a named reducer must be imported, and cannot be, or if
-        its default is out of range.
+        If `radius` or `retrain_every` is None, the class of the reducer (it maps traces to points)
+        is imported, and its default is written. For a reducer given by name the recipe's `params`
+        are written, and no defaults. A reducer object is written as `module:Class` with its
+        parameters that are not None. If a parameter is no text, number or boolean, like the steps
+        of a pipeline, if it is the text "none", or if it is None although its default is not, or if
+        the class is local or stands in `__main__`, the object is written as "object Class", and the
+        user must hand it in again. Raises SettingError if the class of a named reducer must be
+        imported, and cannot be, or if its default is out of range.
         """
         plain = {f.name: getattr(self, f.name) for f in fields(self)}
         plain["reducer"], params = _name_and_params(self.reducer, self.params)

@@ -272,7 +272,8 @@ REDUCER_CHECKS: tuple[Callable[[Any], None], ...] = (
 def check_reducer(reducer: Any) -> None:
     """Run the checks in `REDUCER_CHECKS`, the contract of a reducer, one after another.
 
-    They work on clones of the reducer. The last one limits this thread to one torch thread.
+    A reducer maps traces to points. The checks work on clones of it. The last one limits this
+    thread to one torch thread.
 
     Parameters
     ----------

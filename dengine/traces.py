@@ -389,10 +389,11 @@ class ForceLimitsGate(nn.Module):
         """Check whether a trace, float32 (C, T), keeps the operator's limits of its channels.
 
         Returns WITHIN_LIMITS (-1) if it keeps all limits, or if there are none; else the
-        `ActionCode`: 2 (REJECT) if it leaves a limit with `reject`, otherwise 0 (VERIFY). A limit
-        bounds the values of a channel in a stretch, from `start` to `end` of the time, or of the
-        channel `along`; a trace that has no sample in the stretch leaves the limit. A value that is
-        NaN leaves no limit; a sample whose value in the channel `along` is NaN lies in no stretch.
+        `ActionCode`: 2 (REJECT) if it leaves a limit with `reject`, otherwise 0 (VERIFY, the part
+        is checked). A limit bounds the values of a channel in a stretch, from `start` to `end` of
+        the time, or of the channel `along`; a trace that has no sample in the stretch leaves the
+        limit. A value that is NaN leaves no limit; a sample whose value in the channel `along` is
+        NaN lies in no stretch.
         """
         if self.limits.size(0) == 0:
             return self.within

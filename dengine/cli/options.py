@@ -330,17 +330,18 @@ class RecipeChoice:
     def make_contender(self) -> Contender:
         """Return the `Contender` that a replay runs: a recipe or a baseline, with its name.
 
-        A recipe is all settings of an engine, and a baseline a published method, for comparison.
-        The result is what `Contender.load` returns for the name (conv if none was given), with the
-        settings that were given. Its name is shortened: folder/often.toml becomes often, and
-        module:Class Class.
+        A recipe is all settings of an engine, and a baseline a published method, for comparison. A
+        replay lets one of them decide on recorded parts. The result is what `Contender.load`
+        returns for the name (conv if none was given), with the settings that were given. Its name
+        is shortened: folder/often.toml becomes often, and module:Class Class.
 
         Raises
         ------
         SettingError
-            The recipe or its reducer is not found or cannot be read, or a setting is out of range.
-            This is checked here, before a store is created; a reducer of the user's own, given as
-            module:Class, is imported for that, but a rule of the user's own is not.
+            The recipe or its reducer (it maps traces to points) is not found or cannot be read, or
+            a setting is out of range. This is checked here, before a store is created; a reducer of
+            the user's own, given as module:Class, is imported for that, but a decision rule of the
+            user's own is not.
         """
         from ..experiments.replay import Contender
         from ..reducers import REDUCERS, reducer_class

@@ -117,9 +117,10 @@ def serve(
     `dengine policy STORE --shadow off`. --store, --demo or both must be given.
 
     --demo plays recorded parts like a robot, with a deadline of 5 s or more; if neither --reducer
-    nor a setting of the policy or novelty is given, it decides with the reducer conv, alpha 0.1, a
-    lower bound of 90 % and an audit rate of 5 %. It keeps the parts in --store, and refuses a file
-    that exists; without --store it forgets them at the end.
+    nor a setting of the policy (how it decides) or --novelty is given, it decides with the reducer
+    conv, alpha 0.1, a lower bound of 90 % and an audit rate (share of checks at random) of 5 %. It
+    keeps the parts in --store, and refuses a file that exists; without --store it forgets them at
+    the end.
 
     Without --token-file, programs on the same machine need no token. Other machines reach it only
     with --host, which needs --token-file, and should have --cert and --key. --samples, --rate-hz,

@@ -379,10 +379,10 @@ class Description:
     def to_toml(self) -> str:
         """Return the text of the TOML file, with `notes` as comments above their keys.
 
-        It has the version, the keys that do not have their default values, and the channels, for
-        which `?` stands if there are none. A note on a whole section, like `channels`, is not
-        written; a note on a key that is not there, or within a table that stands in one line, comes
-        first in its section. Notes on `[[check]]` stand in each of its tables.
+        It has the version of the format, the keys that do not have their default values, and the
+        channels, for which `?` stands if there are none. A note on a whole section, like
+        `channels`, is not written; a note on a key that is not there, or within a table that stands
+        in one line, comes first in its section. Notes on `[[check]]` stand in each of its tables.
         """
         values = {"version": self.version, **self.to_dict()}
         lines = self._lines("", {k: v for k, v in values.items() if k not in SECTIONS})

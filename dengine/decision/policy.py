@@ -329,9 +329,12 @@ class Policy:
     def certificate(self, outcomes: Outcomes) -> Certificate:
         """Return the bounds on how often parts decided without a check were decided wrongly.
 
-        With `stops="all"` (every bad accepted part is reported), accepted parts of unknown outcome
-        are left out. Raises ValueError if `outcomes` counts more parts of a group as wrong than are
-        in it.
+        The bound on rejected parts comes from audits (checks at random), and so does that on
+        accepted parts, unless all their outcomes are known; without audits such a bound is 1. With
+        `stops="all"` (every bad accepted part is reported), accepted parts that got no report are
+        left out. An accepted or audited part whose label was withdrawn, and an audit that is not
+        reported in time, count as decided wrongly. Raises ValueError if `outcomes` counts more
+        parts of a group as wrong than are in it.
 
         Parameters
         ----------
@@ -341,8 +344,9 @@ class Policy:
         Returns
         -------
         Certificate
-            Two bounds, for accepted and for rejected parts, at confidence 1 - alpha each, as
-            `certify` returns them; with the prices if the guarantee is "cost".
+            Two bounds, for accepted and for rejected parts, at confidence 1 - alpha (the policy's
+            error level) each, as `certify` returns them; with the policy's prices (of a check and
+            of wrong decisions) if its guarantee is "cost", the rule that decides by them.
         """
         if self.stops == "all":
             outcomes = replace(

@@ -169,25 +169,26 @@ class DecisionMaker:
         x : array of float32, shape (C, T)
             The trace, as `convert` returned it; the record holds a copy.
         part : str or None
-            Number of the part.
+            Number of the part; None if it has none.
         decision_id : str, optional
             An id that the caller chose, and that has no decision yet (`find_earlier`); None: a new
             one.
         verify_reason : Reason, optional
-            Verify for this reason, without asking the model and without checking the force limits
-            (an operator's limits of the signal). If the store is damaged, or its journal (the file
-            on the local disk that gets each record first) cannot be written, `Reason.NO_STORE`
-            takes its place, also if None is passed. A fault of the trace, like a NaN, takes the
-            place of both.
+            Verify (send the part to the check) for this reason, without asking the model and
+            without checking the force limits (an operator's limits of the signal). If the store is
+            damaged, or its journal (the file on the local disk that gets each record first) cannot
+            be written, `Reason.NO_STORE` takes its place, also if None is passed. A fault of the
+            trace, like a NaN, takes the place of both.
 
         Returns
         -------
         StoredDecision
-            The record with its number. If another thread has recorded a decision for the id
-            meanwhile, that decision is returned. Before the first training the decision is VERIFY,
-            `Reason.NO_MODEL`. If the model raises, or returns bounds that are not 0 <= lower <=
-            upper <= 1, that is logged, and the decision is VERIFY, `Reason.MODEL_ERROR`. In both
-            cases a fault of the trace, or a force limit that it leaves, decides instead.
+            The record with its number among the decisions of the robot cell. If another thread has
+            recorded a decision for the id meanwhile, that decision is returned. Before the first
+            training the decision is VERIFY, `Reason.NO_MODEL`. If the model raises, or returns
+            bounds that are not 0 <= lower <= upper <= 1, that is logged, and the decision is
+            VERIFY, `Reason.MODEL_ERROR`. In both cases a fault of the trace, or a force limit that
+            it leaves, decides instead.
         """
         if self._outbox.verify_all_reason:
             verify_reason = Reason.NO_STORE

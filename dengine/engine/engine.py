@@ -332,11 +332,12 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         on the cell. It limits this thread to one torch thread. Records that an earlier process left
         in the journal (the file on the local disk that gets each record first) are written to the
         store; an engine that only reads leaves them there and does not know them. If rows of the
-        store are not as they were written, nothing is raised, but every part is verified
-        (`EngineState.integrity_error`). If the newest version is damaged, the newest intact one
-        decides, and an event (a row in the store's log) says so, also with `reading`. Without an
-        executor, unless it only reads, the call also waits until a retrain can begin at once. If it
-        raises, a store that it opened is closed; an `SqlStore` that was passed may be closed, too.
+        store are not as they were written, nothing is raised, but every part goes to the slow check
+        (`EngineState.integrity_error`). If the newest version (trained model) is damaged, the
+        newest intact one decides, and an event (a row in the store's log) says so, also with
+        `reading`. Without an executor, unless it only reads, the call also waits until a retrain
+        can begin at once. If it raises, a store that it opened is closed; an `SqlStore` that was
+        passed may be closed, too.
 
         Parameters
         ----------
@@ -927,10 +928,11 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         reject; the first follows from the outcomes of the accepted parts if all are known. Without
         either a bound is 1. Before that, everything is written to the disk, and to the store if it
         answers (`flush`); what the store does not take in time does not count. Decisions since the
-        last change of policy count. With `stops="all"` (every bad accepted part is reported)
-        accepted parts of unknown outcome are left out. A forgotten (withdrawn) label and an overdue
-        audit (without a label in time) count as wrong decisions. Raises NotTakenError if not
-        everything is on disk in time, and StoreError if the store cannot be read.
+        last change of policy (the settings of decisions) count. With `stops="all"` (every bad
+        accepted part is reported) accepted parts of unknown outcome are left out. A forgotten
+        (withdrawn) label and an overdue audit (without a label in time) count as wrong decisions.
+        Raises NotTakenError if not everything is on disk in time, and StoreError if the store
+        cannot be read.
         """
         self.flush()
         policy = self.policy

@@ -227,10 +227,10 @@ class Feedback:
         from before the present rule began and so does not update it. A part that was counted among
         them is subtracted from the number that its own label tells, which may make it -1.
 
-        The label takes the next number of the outbox, which records it. The label of a trace
-        without a fault counts as new and enters the training window (the newest labelled traces);
-        in a product (robot cells that share labels and versions) it is read into that from the
-        store, later.
+        The outbox, through which the engine writes to its store, gives the label its next number
+        and records it. The label of a trace without a fault counts as new and enters the training
+        window (the newest labelled traces); in a product (robot cells that share labels and
+        versions) it is read into that from the store, later.
         """
         decision = stored.decision
         number = self._outbox.number_label()

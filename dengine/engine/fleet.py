@@ -113,15 +113,15 @@ class Peers:
         ignored. A failure to take over the rule is logged, and the version is in force all the
         same. This cell's labels since the version become its references (labelled points that new
         traces are compared with), and corrections (changes of labels) since then are applied
-        (`add_labels_since`), without a time limit. A damaged trace is reported by an event (a row
-        in the store's log).
+        (`add_labels_since`), without a time limit. A damaged trace is left out, and reported by an
+        event (a row in the store's log).
 
         A model like umap-learn is fitted again. The labels that it is fitted on are checked against
-        the ledger (the store's hash chain); a difference sets the outbox's `integrity_error`, after
-        which every part is verified. If one of these traces is damaged or missing, if the version
-        is damaged, not kept or of another model, or if the model raises an error that is no
-        StoreError, that is logged, the present version stays in force, and `look` does not return
-        this number again.
+        the ledger (the store's hash chain); a difference sets `integrity_error` of the outbox, by
+        which the engine reaches its store, and every part is verified from then on. If one of the
+        traces that it is fitted on is damaged or missing, if the version is damaged, not kept or of
+        another model, or if the model raises an error that is no StoreError, that is logged, the
+        present version stays in force, and `look` does not return this number again.
 
         Returns whether the version is in force now. Raises StoreError if the store cannot be read;
         `look` then returns the number again.

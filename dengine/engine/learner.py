@@ -545,8 +545,9 @@ class Learner:
 
         It is logged with the `error`, and the previous version stays in force. As many labels as
         its training had are added to the count of new ones, so that the next retrain is soon. The
-        reason in the report is added to `dropped`. Training steps that the time budget cut off are
-        then no reason for another training (`retrain_if_due`).
+        reason in the report is added to `dropped`, the list of such reasons. Training steps that
+        the time budget (the seconds of a retrain) cut off are then no reason for another training
+        (`retrain_if_due`).
         """
         log.warning("a retrain was dropped, for it could not be stored: %s", error)
         self._candidate = None

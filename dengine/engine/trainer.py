@@ -324,10 +324,10 @@ class Retrainer:
     def start(self, current: EngineModel) -> bool:
         """Begin to train a successor of the current model in the executor, on the present window.
 
-        The model decides whether a successor starts from the weights of the current model or from
-        scratch. `collect` returns the outcome. No other training may be under way, which is not
-        checked; but the executor may still work on a training that `discard` gave up, and the new
-        one waits there until that is done.
+        The window holds the newest labelled traces. The model decides whether a successor starts
+        from the weights of the current model or from scratch. `collect` returns the outcome. No
+        other training may be under way, which is not checked; but the executor may still work on a
+        training that `discard` gave up, and the new one waits there until that is done.
 
         Returns False, and begins nothing, if there is no executor, if it refuses work, or if it
         hangs: it is not done with a discarded training after 60 s. An executor that refuses work or

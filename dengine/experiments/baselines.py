@@ -79,7 +79,7 @@ class Baseline(ABC):
         """Train from scratch and return self; the attribute `is_trained` says whether that worked.
 
         If the labels are of one class, or too few for the method, the baseline is untrained
-        afterwards, and `decide` returns VERIFY for every part.
+        afterwards, and `decide` lets every part be checked (VERIFY).
 
         Parameters
         ----------

@@ -410,12 +410,12 @@ def candidates(
 def needed_parts(policy: Policy) -> int:
     """Return the least number of good parts that a policy needs before it can accept a part.
 
-    For the guarantee "local" (a guarantee is the rule that decides) this is the number of good
-    labels within the radius around the part, without a bad one, that puts the lower end of the
-    policy's interval at LB (`Policy.lower_bound`): z^2 LB / (1 - LB), rounded up, with Wilson's
-    interval; it is 10,000,000 if more are needed. For "pooled" it is the number of checked parts,
-    all good, that give enough evidence at error level alpha, if the score of each reaches the
-    threshold that the rule tests. For other guarantees it is 0.
+    A policy is the settings of decisions; its guarantee is the rule that decides. For "local" this
+    is the number of good labels within the radius around the part, without a bad one, that puts the
+    lower end of the policy's interval at LB (`Policy.lower_bound`): z^2 LB / (1 - LB), rounded up,
+    with Wilson's interval; it is 10,000,000 if more are needed. For "pooled" it is the number of
+    checked parts, all good, that give enough evidence at error level alpha, if the score of each
+    (how surely it is good) reaches the threshold that the rule tests. For other guarantees it is 0.
     """
     if policy.guarantee == "local":
         return 1 + bisect_left(
@@ -673,7 +673,8 @@ def _within_reach(
 def _by_policy(replays: Iterable[Replay]) -> dict[Policy, list[Replay]]:
     """Return the replays of each policy, in their order.
 
-    The policies come in the order in which their first replays come.
+    A replay is a recorded stream of parts, decided again; the policy is that of its recipe (the
+    settings of its decisions). The policies come in the order in which their first replays come.
     """
     groups: dict[Policy, list[Replay]] = {}
     for replay in replays:
@@ -727,13 +728,15 @@ def curve_of(
 ) -> CostCurve:
     """Return what a part costs under some policies at these prices, and which policy to choose.
 
-    `groups` has each policy (settings of the rule that decides) with its replays, all of the same
-    shuffles (random orders of the recordings) in the same order. The choice, a policy's name or
-    "check everything", is made again with each price halved and doubled; choices that differ are in
-    the field `price_changes` of the result. Three arguments become fields of the result:
-    `left_behind`, the policies that were dearer in earlier shuffles; `out_of_reach`, policies that
-    were not played, each with the reason; and `fresh`, whether no policy was chosen by these
-    shuffles.
+    `groups` has each policy (settings of the rule that decides) with its replays (runs over
+    recorded parts), all of the same shuffles (random orders of the recordings) in the same order.
+    The choice is the cheapest policy, or one that accepts fewer bad parts and is not significantly
+    dearer; but it is "check everything" if that policy is not cheaper than a check of every part
+    (`_choose` has the exact rule). It is made again with each price halved and doubled; choices
+    that differ are in the field `price_changes` of the result. Three arguments become fields of the
+    result: `left_behind`, the policies that were dearer in earlier shuffles; `out_of_reach`,
+    policies that were not played, each with the reason; and `fresh`, whether no policy was chosen
+    by these shuffles.
     """
     rows, marked, verdict = _choose(groups, costs)
     chosen = _chosen_name(marked, verdict)

@@ -561,8 +561,8 @@ def data_picture(data: Dataset, title: str = "") -> Figure:
     parts, and where the middle 80 % lie. Below are the share of good parts in a sliding tenth of
     the set, and among all, and the mean of each trace's first channel, in the order of the set.
     Traces with a sample that is not finite are not drawn; their labels count in the share. The
-    title is `title`, a colon and what is drawn. Raises SettingError if a field of the data set has
-    a value that no trace can have (`data.spec`).
+    title is `title`, a colon and what is drawn. Raises SettingError as `data.spec` does, for
+    example if two channels have the same name.
     """
     X = data.cube
     finite: NDArray[np.bool_] = np.asarray(np.isfinite(X).all(axis=(1, 2)))

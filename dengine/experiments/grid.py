@@ -139,8 +139,9 @@ class KeptReplays:
         """Read the replay of a task from the folder and return it; None if there is none.
 
         None is also returned if its file is damaged or cannot be read. A task is a replay to be
-        played. The replay gets the name and recipe of the task's contender, who plays it (dengine
-        with a recipe, or a baseline). Raises SettingError as `path` does, for example for a reducer
+        played, in which recorded parts are decided on as in a robot cell. The replay gets the name
+        and recipe of the task's contender, who plays it (dengine with a recipe, or a baseline).
+        Raises SettingError as `path` does, for example for a reducer (it maps traces to points)
         that cannot be hashed.
         """
         path = self.path(task)

@@ -134,12 +134,12 @@ def _share_right(n_wrong: int, n_decided: int) -> float:
 def promise_lines(rows: Sequence[Row]) -> list[str]:
     """Return a sentence for each row of `pool`: were at least LB of its accepted parts good?
 
-    A row has replays with the same settings, counted together. LB is the `lower_bound` of its
+    `pool` counts replays with the same settings together in one row. LB is the `lower_bound` of its
     policy, the success probability that accepted parts must have. The sentence ends with "kept" or
-    "broken", or says that no part, or too few parts, were accepted. It always names the recipe and
-    the guarantee (the rule that decided). It names the interval and alpha only if the rows differ
-    in it. Unless no part was accepted, it has the share of good parts among the accepted parts, the
-    interval of the share of bad parts, and LB.
+    "broken", or says that no part, or too few parts, were accepted. It always names the recipe (all
+    settings) and the guarantee (the rule that decided). It names the interval and alpha only if the
+    rows differ in it. Unless no part was accepted, it has the share of good parts among the
+    accepted parts, the interval of the share of bad parts, and LB.
     """
     varying = [name for name in ("interval", "alpha") if len({row[name] for row in rows}) > 1]
     lines = []

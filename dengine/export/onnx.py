@@ -112,8 +112,11 @@ def export_onnx(
         If the engine's force limits do not fit `trace`.
     OutputError
         If a file exists, without `force`, or cannot be written.
-    StoreError, OSError
-        As in `prepare_export` and `write_export`.
+    StoreError
+        If the engine's store cannot be read, or the export cannot be recorded in it.
+    OSError
+        If the source text of the reducer's module cannot be found, or an old signature cannot be
+        removed.
     """
     _require_packages()
     import onnx
@@ -305,9 +308,11 @@ class OnnxDecision(nn.Module):
     def fault(self, trace: Tensor) -> Tensor:
         """Return the position in `Reason` of what is wrong with a trace, () int64; 0 if nothing is.
 
-        Only the first fault that applies is returned, in this order: a sample is not finite, all
-        samples are equal, a sample is at or beyond the sensor's limit, a sample is too large
-        (beyond 1e18). The result is the same as in an engine (`TraceGate`).
+        `Reason` lists the faults of a trace and the other reasons of decisions. Only the first
+        fault that applies is returned, in this order: a sample is not finite, all samples are
+        equal, a sample is at or beyond ±`self.limit` (the range of the sensor; infinity if none is
+        stated), a sample is too large (beyond ±1e18). The result is the same as that of
+        `TraceGate`, which an engine uses.
         """
         low = trace.min()
         high = trace.max()

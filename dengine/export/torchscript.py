@@ -234,8 +234,8 @@ class ExportedModel:
         outcome ends first. If the file's description (`metadata`) says `stops` "all" (every bad
         accepted part is reported), it is learned as good and becomes a reference (a labelled point
         with which later traces are compared). If it says "some", the part is counted as unreported.
-        A VERIFY or REJECT that is still pending is discarded. After a faulty trace (NaN, infinite,
-        constant, too large or at the sensor's limit) no decision is pending.
+        A VERIFY or REJECT that is still pending is discarded. A faulty trace (NaN, infinite,
+        constant, too large or at the sensor's limit) gets VERIFY, and no decision is pending then.
 
         Parameters
         ----------
@@ -248,7 +248,7 @@ class ExportedModel:
         Returns
         -------
         ExportedDecision
-            Action (VERIFY asks for the slow check), reason, bound of the success probability,
+            Action (VERIFY asks for the slow check), reason, both bounds of the success probability,
             numbers of good and bad labels nearby, and embedding.
 
         Raises

@@ -114,9 +114,9 @@ class Explanation:
 def find_decision_id(store: SqlStore, part: str) -> str:
     """Return the id of the only decision on a part; a REJECT counts only if there is no other.
 
-    A part that was rejected may come again, so its rejects are passed over if it also has a
-    decision that is no REJECT. Only the newest 20 decisions of this robot cell on the part are
-    looked at.
+    A part that was rejected (REJECT, without a check) may come again, so its rejects are passed
+    over if it also has a decision that is no REJECT. Only the newest 20 decisions of this robot
+    cell on the part are looked at.
 
     Parameters
     ----------

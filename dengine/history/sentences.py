@@ -163,11 +163,12 @@ def explain_in_words(
 def _explain_reason(decision: Decision, trace: TraceArray, circumstances: Circumstances) -> str:
     """Return the reason of a decision, as text that follows "Accepted", "Rejected" or "Verified".
 
-    Verified is a part that was sent to the check. If the reason is a force limit (an operator's
-    limit of the signal) or a safe mode (after an alarm parts are checked until outcomes allow
-    decisions again), the text names the limit that the trace leaves, or the alarm, or says that it
-    is not known. Raises SettingError for a part outside the force limits if one of these limits
-    does not fit the trace.
+    Verified is a part that was sent to the check. `circumstances` are the settings and the state of
+    the engine at the decision. If the reason is a force limit (an operator's limit of the signal)
+    or a safe mode (after an alarm about wrong decisions or novel traces, parts are checked until
+    outcomes allow decisions again), the text names the limit that the trace leaves, or the alarm,
+    or says that it is not known. Raises SettingError for a part outside the force limits if one of
+    these limits does not fit the trace.
     """
     if decision.reason is Reason.OUTSIDE:
         left = " and ".join(_limits_left(trace, circumstances)) or "which is not known"

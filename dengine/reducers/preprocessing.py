@@ -50,8 +50,8 @@ class Preprocessor(nn.Module):
 
         Only the first 256 of the traces (n, C, T) are read. First `average` neighbouring samples
         are averaged to one. Then `forward` standardises a channel x to (x - mean) * scale, clipped
-        at ±8, and multiplies its differences in time by `difference_scale`. A scale is 1 /
-        (standard deviation + 1e-6), so that a channel that never moved has a finite scale.
+        at ±8, and multiplies the differences in time of the result by `difference_scale`. A scale
+        is 1 / (standard deviation + 1e-6), so that a channel that never moved has a finite scale.
         """
         averaged = self.average_samples(traces[:STATISTICS_TRACES]).double()
         self.mean.copy_(averaged.mean((0, 2))[:, None])

@@ -62,10 +62,11 @@ def read_tokens(file: Path) -> Tokens:
     """Read tokens from a file that only its owner may use, in the order of its lines.
 
     A token authorizes requests. Each line is a secret, optionally followed by `viewer` (who may
-    only read) or `operator` (who may also change something), and then by the name of the token's
-    owner. A secret alone is an operator's, without a name. Empty lines are skipped, and what is
-    beyond 64 KiB is not read. A file in the folder that the variable CREDENTIALS_DIRECTORY names
-    (systemd sets it) may also be readable by its group. On Windows no permission is checked.
+    only read) or `operator` (who may also change something), and after that optionally by the name
+    of the token's owner. A secret alone is an operator's, without a name. Empty lines are skipped,
+    and what is beyond 64 KiB is not read. A file in the folder that the variable
+    CREDENTIALS_DIRECTORY names (systemd sets it) may also be readable by its group. On Windows no
+    permission is checked.
 
     Raises
     ------

@@ -458,9 +458,10 @@ class CellService:
     def close(self) -> None:
         """Answer the requests in the queue, close the engine and the stores, and end the threads.
 
-        Every iteration over `changes` ends. It blocks until all this is done. Requests that come
-        after the call get BusyError. A second call does nothing; it does not wait for the first. An
-        error of the engine's closing ends its thread and is not raised here.
+        Every iteration over `changes`, by which clients wait for changes, ends. It blocks until all
+        this is done. Requests that come after the call get BusyError. A second call does nothing;
+        it does not wait for the first. An error of the engine's closing ends its thread and is not
+        raised here.
         """
         if self._closing:
             return
@@ -483,8 +484,8 @@ class CellService:
     def _notify_observers(self, response: T) -> T:
         """Call each function in `observers` with a response or a `RetrainReport`; return it.
 
-        A `RetrainReport` is also logged. What an observer raises is raised; the observers after it
-        are not called then.
+        A `RetrainReport` tells what came of a retrain, and is also logged. What an observer raises
+        is raised; the observers after it are not called then.
         """
         # Decisions and reports are in the store: only a retrain needs a line of the log.
         if isinstance(response, RetrainReport):

@@ -251,8 +251,9 @@ class DecisionTable(CellTable):
         within : int
             A check is overdue once so many or more decisions have followed its own.
         since_version : int, default 0
-            The model version with which `within` came into force. If the newest decision is by an
-            earlier version, or there is none, only the numbers that are stored with labels count.
+            The number of the model version (trained model) with which `within` came into force. If
+            the newest decision is by an earlier version, or there is none, only the numbers that
+            are stored with labels count.
 
         Returns
         -------

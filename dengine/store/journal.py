@@ -416,10 +416,10 @@ class Journal:
     def _write_header(self) -> None:
         """Write the header, the first 256 bytes: the text MAGIC, then JSON, padded with zeros.
 
-        The JSON has this process as the owner, the number of the records that the store has, the
-        offset behind them, number and digest of the newest entry of the ledger (the store's hash
-        chain), and a CRC-32 of these fields. Nothing is synced. Raise OSError if it cannot be
-        written.
+        The JSON has this process as the owner, the number of the records in the journal (a log on
+        the local disk) that the store has, the offset behind them, number and digest of the newest
+        entry of the ledger (the store's hash chain), and a CRC-32 of these fields. Nothing is
+        synced. Raise OSError if it cannot be written.
         """
         fields = {
             "owner": describe_process()[:60],

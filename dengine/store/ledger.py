@@ -414,15 +414,16 @@ def find_integrity_error(connection: sa.Connection, cell_id: str, key: bytes, fi
 def _find_table_error(
     connection: sa.Connection, cell_id: str, name: str, first: int, last_entry: int, chained: str
 ) -> str:
-    """Compare a cell's rows of the table `name` with the ledger.
+    """Compare a robot cell's rows of the table `name` with the ledger.
 
     The ledger is a hash chain with an entry for each transaction. Return the first difference in
     words, or "". A difference is a row whose values do not fit its stored checksum, or rows that
-    were removed, added or replaced. `name` is that of a table in IN_FORCE: labels, corrections or
-    versions; the stored states of versions (their arrays) are not read. `chained` is the digest
-    over all rows of the table so far that ledger entry `last_entry` has. Rows of later entries are
-    not read, since another connection may write meanwhile. Reading begins at number `first`, or at
-    an earlier row that belongs to the same ledger entry; rows before it are not checked.
+    were removed, added or replaced. `name` is that of a table in IN_FORCE: labels, corrections
+    (changes of labels) or versions (trained models); the stored states of versions (their arrays)
+    are not read. `chained` is the digest over all rows of the table so far that ledger entry
+    `last_entry` has. Rows of later entries are not read, since another connection may write
+    meanwhile. Reading begins at the row with number `first`, or at an earlier row that belongs to
+    the same ledger entry; rows before it are not checked.
     """
     number = IN_FORCE[name]
     table = number.table

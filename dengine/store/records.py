@@ -72,7 +72,7 @@ def _when(record: Any) -> datetime:
 
 
 def unknown_decision(decision_id: str) -> UnknownDecisionError:
-    """Return the error for a report on a decision that the store does not hold."""
+    """Return the error for the id of a decision that the store does not hold."""
     return UnknownDecisionError(
         f"Expected the id of a stored decision, got {shortened(decision_id)}, which this cell's "
         "store does not hold; report the `Decision.id` that `decide` returned, to the same store "

@@ -56,11 +56,11 @@ def _columns(record: type, *names: str, key: str = "") -> list[sa.Column[Any]]:
 
 
 def _table(name: str, *parts: Any) -> sa.Table:
-    """Return a new table of a cell's rows, with the columns and indexes `parts`.
+    """Return a new table of a robot cell's rows, with the columns and indexes `parts`.
 
-    Added are `cell_id`, part of the primary key, the number of the row's entry in the ledger (the
-    cell's hash chain), and the row's checksum (`row_sum`). The table is entered into METADATA, so
-    that it is created in a new database.
+    Added are the columns `cell_id`, part of the primary key; `entry`, the number of the row's entry
+    in the ledger (the cell's hash chain); and `sum`, the row's checksum (from `row_sum`). The table
+    is entered into METADATA, so that it is created in a new database.
     """
     return sa.Table(
         name,

@@ -128,8 +128,9 @@ class RtdeRecipe:
     def columns(self) -> tuple[str, ...]:
         """Names of the values in a data package, in their order, cached.
 
-        A single value has the name of its field, like `timestamp`, and an element of a vector a
-        name like `actual_TCP_force[2]`.
+        A data package is a set of values that the robot's controller sends at once. A single value
+        has the name of its field, like `timestamp`, and an element of a vector a name like
+        `actual_TCP_force[2]`.
         """
         sizes = [len(TYPES[field_type]) for field_type in self.types]
         fields = zip(self.names, sizes, strict=True)

@@ -61,16 +61,16 @@ def propose_clock(p: Proposal) -> None:
     """Find the column of times and its form, and set `time.column` and `time.format` in `p`.
 
     `p` is the description so far; only columns without a use in it are looked at. `time.column`
-    becomes the only column that may tell the time (`is_clock`). It is set to `?` (the user must
-    answer), with a note, if several columns may, or if one may and others a part of it, like a date
-    or whole seconds that are the same in all rows of a recording; these are not looked for beside a
-    clock whose cells tell the day. If no column may tell the time, `time.column` is `?` if the
-    columns have no names, if one is named `s`, which may be seconds or the tool's position, if one
-    may count the samples (`is_counter`), or if one is named like a clock and has numbers that
-    change; otherwise it stays empty. Stated columns are kept; only their forms are found. Of a
-    column that is set, `time.format`, its unit or a pattern like `%H:%M:%S`, may be `?`
-    (`form_of`). Raises SettingError for a malformed `windows.trigger`, the condition at which long
-    recordings are cut.
+    becomes the only column that may tell the time, by its cells or its name (`is_clock`). It is set
+    to `?` (the user must answer), with a note, if several columns may, or if one may and others a
+    part of it, like a date or whole seconds that are the same in all rows of a recording; these are
+    not looked for beside a clock whose cells tell the day. If no column may tell the time,
+    `time.column` is `?` if the columns have no names, if one is named `s`, which may be seconds or
+    the tool's position, if one may count the samples (`is_counter`), or if one is named like a
+    clock and has numbers that change; otherwise it stays empty. Stated columns are kept; only their
+    forms are found. Of a column that is set, `time.format`, its unit or a pattern like `%H:%M:%S`,
+    may be `?` (`form_of`). Raises SettingError for a malformed `windows.trigger`, the condition at
+    which long recordings are cut.
     """
     clocks = [*filter(is_clock, p.unused)]
     if is_stated := "time.column" in p.stated:
@@ -120,10 +120,10 @@ def is_counter(column: Column) -> bool:
 
     A mere numbering of the rows does not. The steps from row to row (`Column.steps`) decide. For a
     column that is named like a counter (`index`, `sample`, `n`, ...) the result is True if any step
-    differs by more than 1 % from the median step, or if this is negative. For any other column it
-    is True if no step differs so and the median is neither 0 nor 1; but it is False if the column
-    is named like a force, has a unit of a quantity that is not time, or is named like `x*`, the
-    samples of a table with a part in each row.
+    differs by more than 1 % from the median step, or if the median is negative. For any other
+    column it is True if no step differs so and the median is neither 0 nor 1; but it is False if
+    the column is named like a force, has a unit of a quantity that is not time, or is named like
+    `x*`, the samples of a table with a part in each row.
     """
     steps = column.steps
     usual = float(np.median(steps)) if len(steps) else 0.0

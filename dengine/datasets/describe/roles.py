@@ -247,8 +247,9 @@ def _doubt_on(p: Proposal, name: str) -> str:
 
     The reasons: the column is named like a value that a controller aims at or like a limit
     (`F_soll`, `set_force`, `F_max`); `name` is like `x*` and stands for the columns `x0`, `x1`, ...
-    of the first of `p.tables`, and a step from one of their numbers to the next is longer than 1.5
-    times the median step.
+    of the first of `p.tables`, and a step from the number in one of these names to that in the next
+    is longer than 1.5 times the median step. `p` is the description so far, and `p.tables` are the
+    recordings that are looked at.
     """
     if SET_VALUE.search(name):
         return f"{name} may be a set value"

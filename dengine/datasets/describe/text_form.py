@@ -230,12 +230,13 @@ def propose_form(p: Proposal, contents: Mapping[str, bytes], faults: list[Fault]
     `p` is the description so far, and `[text]` its section on how text files are written. Files
     with another delimiter, number of columns or header are left out: they move from `p.names` to
     `p.others`. If two or more of them have at least 8 rows of samples, or if a single one has, and
-    its name differs by a number only from that of a file in the result, `exclude` is set to `?`
-    (the user must answer), with a note that asks whether they are recordings. For a file that is no
-    text, or whose header is not certain, a fault (why it cannot be read) is appended to `faults`,
-    and it stays in `p.names`; if all are such, nothing is set, and the result is empty. Of equally
-    frequent forms that of the file with the most cells counts. Keys that the user stated stay.
-    Raises LookupError for a stated encoding that Python does not know.
+    its name differs by a number only from that of a file in the result, `exclude` (the patterns of
+    files that are no recordings) is set to `?` (the user must answer), with a note that asks
+    whether they are recordings. For a file that is no text, or whose header is not certain, a fault
+    (why it cannot be read) is appended to `faults`, and it stays in `p.names`; if all are such,
+    nothing is set, and the result is empty. Of equally frequent forms that of the file with the
+    most cells counts. Keys that the user stated stay. Raises LookupError for a stated encoding that
+    Python does not know.
 
     contents : the contents of the files that are looked at, by name.
     """

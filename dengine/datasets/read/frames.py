@@ -52,7 +52,8 @@ def read_objects(content: bytes, source: str, form: TextForm, has_lines: bool) -
 def _table_of(source: str, rows: Rows, wanted: str) -> Table:
     """Return a table of rows; without rows raise UnreadableError, which says what was `wanted`.
 
-    A cell is None if its row lacks the column. `source` is the name of the file.
+    `rows` are pairs of a row's line and its cells by column. A cell is None if its row lacks the
+    column. `source` is the name of the file.
     """
     if not rows:
         raise UnreadableError(f"Expected {wanted}, got none")

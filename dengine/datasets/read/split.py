@@ -45,9 +45,10 @@ def table_of(content: bytes, name: str, description: Description) -> Table:
 def word_columns(description: Description) -> set[str]:
     """Return the columns whose cells are read as words (texts), also if they are channels, too.
 
-    These are the columns that the description names for dates, times of day, part numbers, labels
-    and `order`, and those whose words tell which rows are samples (`[rows]`). The set also has ""
-    if `[label]` or a `[[check]]`, another source of labels, names no column.
+    The description says how recordings are read. The columns are those that it names for dates,
+    times of day, part numbers, labels and the order of the parts (`order`), and those whose words
+    tell which rows are samples (`[rows]`). The set also has "" if `[label]` or a `[[check]]`,
+    another source of labels, names no column.
     """
     clock = description.time
     words = {name for name, form in zip(clock.column, clock.format, strict=False) if is_dated(form)}
