@@ -320,7 +320,8 @@ def _replay_and_print(
     source : DataChoice
         The data set that the user asked for.
     stream : Stream
-        How it is played: seeds, number of parts (cycles), order.
+        How it is played: seeds, number of parts (cycles), order, replays at a time, and a folder of
+        finished replays, which are read from there and not played again.
     check_seconds : float
         Duration of a verification, from which the saved time is computed.
     out : Out or None

@@ -191,8 +191,8 @@ class Dataset:
         Its X is a copy, for one channel of shape (n, T). `channels` and `unit` become those of the
         selected channels; all other fields stay. Raises DataError for an unknown name, for no name,
         and if the channels of the data set have no names, and SettingError if its property `spec`
-        does. A name that comes twice is accepted, but `spec` of the result then raises
-        SettingError.
+        (what an engine expects of such traces) does. A name that comes twice is accepted, but
+        `spec` of the result then raises SettingError.
         """
         names = ", ".join(self.channels) or "none, its channels have no names"
         expect_data(

@@ -293,7 +293,7 @@ def _read_npz(path: Path) -> Dataset:
 
 
 def _read_store(path: Path) -> Dataset:
-    """Return the labelled traces of a store, with corrected labels, in the order of these.
+    """Return the labelled traces of a store, with corrected labels, the oldest label first.
 
     They are those of the robot cell named "cell" and of the other cells that make the same product.
     Traces with a fault, which are never used in training, and labels that a person withdrew are

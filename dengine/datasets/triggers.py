@@ -99,13 +99,14 @@ def as_trigger(value: Any) -> Trigger:
 
     A trigger is a condition on a signal; when it is met, an insertion begins. "bit=0": digital
     output 0 is on. "register@NAME": the signal NAME is not zero; "register=1@NAME": it is 1.
-    "contact=5": the force FZ_Base is 5 N or more, in either direction. "motion=0.002": the tool
-    moves faster than 2 mm a second. Only bit and contact need a number; without it, register means
-    any value but zero and motion 0.002. A bit is 0 to 31, a register's number any integer; a force
-    and a speed are decimals above 0, without an exponent. They are compared with the signal as it
-    was recorded: no unit is converted. Without @SIGNAL the signal is that of the kind in `KINDS`.
-    The trigger's `quiet_s`, the seconds for which the condition must not have been met before, is
-    always that of the kind. Raises SettingError for any other value.
+    "contact=5": the force is 5 N or more, in either direction. "motion=0.002": the tool moves
+    faster than 2 mm a second. Only bit and contact need a number; without it, register means any
+    value but zero and motion 0.002. A bit is 0 to 31, a register's number any integer; a force and
+    a speed are decimals above 0, without an exponent. They are compared with the signal as it was
+    recorded: no unit is converted. Without @SIGNAL the signal is `actual_digital_output_bits` for
+    bit, `output_int_register_25` for register, `FZ_Base` for contact and `actual_TCP_speed` for
+    motion. The trigger's `quiet_s`, the seconds for which the condition must not have been met
+    before, is 0.2 for contact, 0.1 for motion and else 0. Raises SettingError for any other value.
     """
     if isinstance(value, Trigger):
         return value

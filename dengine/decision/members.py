@@ -311,8 +311,9 @@ class MemberEvidence(nn.Module):
         A safe mode ends only here. After an alarm about accepted or rejected parts it ends when
         that side has another threshold than `CLOSED`; the other side may have one earlier, and then
         decides again. After too many novel traces it ends when few traces are novel again (the sum
-        of their detector is 25 or more, see `observe`) and one of the two thresholds is not
-        `CLOSED`. At the end of any safe mode this sum restarts at 0.
+        of their detector, to which `observe` then adds 1 for a trace that is not novel and -4 for a
+        novel one, is 25 or more) and one of the two thresholds is not `CLOSED`. At the end of any
+        safe mode this sum restarts at 0.
         """
         self.count_outcome(
             Detector.ACCEPTED_PARTS.value, lower, not success, predicted, inclusion_probability

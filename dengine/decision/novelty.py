@@ -141,12 +141,12 @@ class NoveltyGate(nn.Module):
         by `scores`. P is C * (4*S + 3). A channel is cut into S segments, stretches of equal length
         that together cover the trace, and may overlap. For each channel the features are the S
         minima and the S maxima of the segments, then 2*S + 3 logarithms of roughness, which is the
-        norm of the differences of successive samples in a stretch, plus `noise_floor`. The first S
-        are of first differences in the segments, the next S of second differences in the segments.
-        The last three, for gaps, are of first differences in brief stretches. Such a stretch has
-        T / 100 differences, rounded down, and at least one. These three are the least roughness
-        over stretches of twice that length, then the least and the largest over stretches of that
-        length.
+        norm of the differences of successive samples in a stretch, plus `noise_floor` (a share of
+        the usual roughness of the traces of the training). The first S are of first differences in
+        the segments, the next S of second differences in the segments. The last three, for gaps,
+        are of first differences in brief stretches. Such a stretch has T / 100 differences, rounded
+        down, and at least one. These three are the least roughness over stretches of twice that
+        length, then the least and the largest over stretches of that length.
         """
         pieces = x.unfold(-1, self.length, self.stride)  # (..., C, S, L)
         steps = x[..., 1:] - x[..., :-1]  # from sample to sample

@@ -219,8 +219,9 @@ class Policy:
         are one text, separated by spaces, or "none"; in older stores their name is "windows". Names
         that are no settings are ignored. A missing guarantee (the rule that decides) is "local",
         and a missing audit rate (share of the parts to be accepted or rejected that are checked all
-        the same) is 0; with `prices` and no guarantee they are "cost" and 0.05. Raises SettingError
-        for a value out of its range, and for an audit rate of 0 with a guarantee that needs audits.
+        the same) is 0; with `prices` (of a check and of the two errors) and no guarantee they are
+        "cost" and 0.05. Raises SettingError for a value out of its range, and for an audit rate of
+        0 with a guarantee that needs audits.
         """
         settings = {f.name: values[f.name] for f in fields(cls) if f.name in values}
         limits = values.get("force_limits", values.get(OLD_NAME, NO_LIMITS))

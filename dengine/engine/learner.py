@@ -761,14 +761,15 @@ class Learner:
         """Go on under another policy, as a new version of the same model.
 
         The version is stored with `event`, and `take_report` then returns a report of it. With
-        `policy` the decision rule (bound to action) starts anew and counts the decisions that
-        `evidence` names. With None only settings outside the model have changed, and its rule goes
-        on. Before the first retrain only the event is stored. A failure to make the model with the
-        new rule ready is logged. Raises SettingError if the rule cannot be made, or the recipe (the
-        settings) of another cell of the product (robot cells that share labels and versions) cannot
-        be read; StoreError if the event cannot be stored, also because another cell of the product
-        stored a version meanwhile; and what the constructor of a user's rule raises, except
-        TypeError. After each of these errors nothing is changed.
+        `policy` the decision rule (which turns the bounds of a success probability into an action)
+        starts anew and counts the decisions that `evidence` names. With None only settings outside
+        the model have changed, and its rule goes on. Before the first retrain only the event is
+        stored. A failure to make the model with the new rule ready is logged. Raises SettingError
+        if the rule cannot be made, or the recipe (the settings) of another cell of the product
+        (robot cells that share labels and versions) cannot be read; StoreError if the event cannot
+        be stored, also because another cell of the product stored a version meanwhile; and what the
+        constructor of a user's rule raises, except TypeError. After each of these errors nothing is
+        changed.
         """
         live = self.live
         template = live.template

@@ -308,10 +308,11 @@ class CostCurve:
 
         Its columns are the guarantee (the rule that decides), alpha and lower_bound of the policy
         and the fields of `PolicyCost`: costs in the user's unit, and shares and error rates from 0
-        to 1. Of `bad` and `good` each field is a column, like `bad_rate`. `chosen` is True for the
-        policy that pays or may pay, if there is one. `reported` is False for the policies that the
-        search left behind, because they were dearer in earlier shuffles (replays in random order).
-        Their costs come from these shuffles and are not comparable with those of other rows.
+        to 1. Each field of `bad` (bad parts among the accepted ones) and `good` (good parts among
+        the rejected ones) is a column, like `bad_rate`. `chosen` is True for the policy that pays
+        or may pay, if there is one. `reported` is False for the policies that the search left
+        behind, because they were dearer in earlier shuffles (replays in random order). Their costs
+        come from these shuffles and are not comparable with those of other rows.
         """
         import pandas as pd
 
@@ -346,8 +347,9 @@ def settings_of(policy: Policy) -> Settings:
 
     They are alpha, lower_bound and guarantee (the rule that decides). For the guarantee "cost" they
     are only `prices`, from which `Policy` infers this guarantee; lower_bound has no effect then.
-    stops is added if it is "all", and alpha under "cost" and audit_rate if they are not those that
-    `Policy` gives by itself. The interval, the force limits and all other settings are left out.
+    stops is added if it is "all" (every bad accepted part stops the line and is reported), and
+    alpha under "cost" and audit_rate if they are not those that `Policy` gives by itself. The
+    interval, the force limits and all other settings are left out.
     """
     names = ["prices"] if policy.guarantee == "cost" else ["alpha", "lower_bound", "guarantee"]
     settings = {name: getattr(policy, name) for name in names}
@@ -805,10 +807,11 @@ def _chosen_name(row: PolicyCost, verdict: str) -> str:
 def _policy_cost(policy: Policy, replays: Sequence[Replay], costs: Costs) -> PolicyCost:
     """Return what a part costs under a policy, as a `PolicyCost` that is computed from its replays.
 
-    It has the mean cost with an interval, the expected cost (with half an error added to each share
-    of wrong decisions), the shares of parts that were checked, accepted and rejected, and the
-    shares of wrong decisions (bad parts among the accepted ones, good parts among the rejected
-    ones). All replays are equally long; the prices are `costs`.
+    It has the mean cost with an interval, the part of it that comes from the order (`luck`), the
+    mean cost over the last third of each replay (`late`), the expected cost (with half an error
+    added to each share of wrong decisions), the shares of parts that were checked, accepted and
+    rejected, and the shares of wrong decisions (bad parts among the accepted ones, good parts among
+    the rejected ones). All replays are equally long; the prices are `costs`.
     """
     n = len(replays)
     verified, accepted, rejected = (

@@ -213,8 +213,9 @@ def embedding_map(replay: Replay, title: str = "") -> Figure:
 def _draw_neighbourhood(figure: Figure, centre: Floats, radius: float, is_strip: bool) -> None:
     """Draw a point as a cross, with its neighbourhood, into all axes of a figure; add a legend.
 
-    `centre` (2,) is the point, and `radius` the distance within which labels are counted. The
-    neighbourhood is a circle, or a strip between two vertical lines if `is_strip`.
+    `centre` (2,) is the point, which the legend calls the newest part, and `radius` the distance
+    within which labels are counted. The neighbourhood is a circle, or a strip between two vertical
+    lines if `is_strip`.
     """
     from matplotlib.patches import Circle
 

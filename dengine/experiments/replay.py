@@ -529,8 +529,8 @@ def replay(
         Anything `load_dataset` takes.
     recipe : object
         Anything `Recipe.load` takes, the name of a baseline (a method to compare with, in
-        `experiments.baselines.BASELINES`), a `Contender`, or, for a model of your own, a fresh
-        engine. Afterwards this engine holds what it learned.
+        `experiments.baselines.BASELINES`), a `Contender` (a named recipe or baseline), or, for a
+        model of your own, a fresh engine. Afterwards this engine holds what it learned.
     seed : int, default 0
         Of the shuffle, and of the engine unless one is given; the same seed gives the same
         decisions, but not with an engine of yours whose trainings end by a time budget.

@@ -107,7 +107,8 @@ def read_journal(path: FilePath, spec: TraceSpec) -> CellJournal:
     ----------
     path : path-like
     spec : TraceSpec
-        What the traces must be; other lengths are fitted as `spec.fit` says.
+        What the traces must be; other lengths are cut, padded, resampled or refused, as `spec.fit`
+        says.
 
     Returns
     -------

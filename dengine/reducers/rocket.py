@@ -414,11 +414,11 @@ class RocketReducer(ProbabilityReducer):
     ) -> Floats:
         """Fit the classifier heads like `train`, but without checking the input; return the points.
 
-        Call `_initialize` first. Traces are (n, C, T), labels (n,) 1 or 0; they may be of one
-        class. `folds` (n,) are the folds, 0 to K - 1: fixed groups of traces. `numbers` (n,), the
-        increasing numbers of the labels, identify the traces: features are computed only for those
-        that the cache lacks, which then holds these traces alone. Without numbers the cache is not
-        used.
+        Call `_initialize` first, which draws the convolution kernels. Traces are (n, C, T), labels
+        (n,) 1 or 0; they may be of one class. `folds` (n,) are the folds, 0 to K - 1: fixed groups
+        of traces. `numbers` (n,), the increasing numbers of the labels, identify the traces:
+        features are computed only for those that the cache lacks, which then holds these traces
+        alone. Without numbers the cache is not used.
 
         Head k is a logistic regression. It starts from its last weights, and is fitted on the rows
         outside fold k of at most 4000 rows (`sample_rows`). Each `Tower`, a group of features with

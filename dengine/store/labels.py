@@ -297,9 +297,9 @@ class LabelTable(CellTable):
         """Return how many accepted parts before the cell's newest label had no report.
 
         Each label stores, as `silent`, the number of such parts since the label before it, less 1
-        if its own part was counted before. The sum over the cell's labels is returned, with
-        forgotten ones (withdrawn by a person), and without labels of quarantined traces (stored,
-        but never used in training).
+        if its own part was counted, by this label or an earlier one; so it may be -1. The sum over
+        the cell's labels is returned, with forgotten ones (withdrawn by a person), and without
+        labels of quarantined traces (stored, but never used in training).
 
         Parameters
         ----------

@@ -71,11 +71,12 @@ def read_rule_progress(
     -------
     RuleProgress
         `last_seq` is the number of the newest label that the rule includes. It is 0 if there is no
-        version, or if the rule must be rebuilt from all outcomes: a decision counts as overdue, a
+        version, or if the rule must be rebuilt from all outcomes: `overdue_ids` is not empty, a
         label was corrected meanwhile, the stored rule is incomplete, or the version is earlier than
         `since_version` or of another robot cell. Up to the decision number `overdue_to` a check
         without a label is overdue. `overdue_ids` are the ids of these decisions, but only of those
-        with a lower bound above 0 or an upper one below 1 (`overdue_outcomes`).
+        by `since_version` or a later version, and with a lower bound above 0 or an upper one below
+        1 (`overdue_outcomes`).
     """
     state = {} if version is None else version.state
     overdue_to = max(

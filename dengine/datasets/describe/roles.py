@@ -111,14 +111,15 @@ def set_rows(p: Proposal, rows: Mapping[str, RowWords]) -> None:
 def qualify_rows(p: Proposal) -> None:
     """Find the columns that tell which rows are samples, and set them as `[rows]` in `p`.
 
-    Of the columns without a role, `qualifies` says which ones they are. If such a column has
-    several words, its `keep` is `?`, with a note that counts them; if it has only one word, this
-    becomes its `keep`. If the user stated some words of a column, its other words are added to
-    `keep`, or to `drop` if `keep` is stated. If there are more than 12 others, `*` is added in
-    their place; if `*` is stated, nothing is added. Rows that are no samples are left out of
-    `p.tables` and `p.columns`; but none are while a `keep` is `?`, nor those of a recording that
-    lacks a column of `[rows]`. Raises UnreadableError if cells are lists, and SettingError for a
-    malformed `windows.trigger`.
+    Of the columns that no key of the description uses yet, `qualifies` says which ones they are. If
+    the cells of such a column have several words (texts), its `keep` is `?`, with a note that
+    counts them; if they have only one word, this becomes its `keep`. If the user stated some words
+    of a column, its other words are added to `keep`, or to `drop` if `keep` is stated. If there are
+    more than 12 others, `*` is added in their place; if `*` is stated, nothing is added. Rows that
+    are no samples are left out of `p.tables` and `p.columns`, and so are whole recordings whose
+    only cell in such a column is in `drop`, unless these are all recordings; but no rows are left
+    out while a `keep` is `?`, nor those of a recording that lacks a column of `[rows]`. Raises
+    UnreadableError if cells are lists, and SettingError for a malformed `windows.trigger`.
     """
     rows = dict(p.description.rows)
     for name in rows.keys() & p.columns.keys():
@@ -217,10 +218,11 @@ def propose_channels(p: Proposal, units: Mapping[str, str]) -> None:
     column.
     A name decides only if the unit is that of a force or torque, or unknown. The channels stay
     empty, with a note, if `units` is empty, if several columns fit the rule, if the column that
-    fits has no unit of force or torque and another column has one, if one of these columns is named
-    like a set value or a limit, or is numbered unevenly (`_doubt_on`), or if a unit, factor or rate
-    differs between recordings (`_other_scales`). Raises SettingError for a malformed
-    `windows.trigger`.
+    fits has no unit of force or torque and another column has one, if the column that fits is named
+    like a set value or a limit or stands for numbered columns with a gap, like `x0`, `x1`, `x5`
+    (`_doubt_on`), or if a unit, a factor of scale or a sampling rate that the recordings state
+    differs between them (`_other_scales`). Raises SettingError for a malformed `windows.trigger`
+    (the condition at which a part begins).
 
     units : the columns that may be channels, with their units, "" for unknown.
     """

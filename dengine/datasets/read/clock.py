@@ -64,12 +64,12 @@ def times_of(table: Table, clock: Clock, form: TextForm) -> Floats:
     table : Table
         The rows of a recording.
     clock : Clock
-        The section `[time]` of the description of the files, which has passed `check_forms`, with
-        as many formats as columns. A format is a unit, `iso` (ISO 8601) or a pattern like
+        The section `[time]` of the description of the files, with as many formats as columns and a
+        known time zone (`check_forms`). A format is a unit, `iso` (ISO 8601) or a pattern like
         `%H:%M:%S`. The times in the columns are added up; a column of one cell holds for all rows.
-        A column of datetimes is read as `iso`, whatever its format; but only if `iso` is stated,
-        times of day in other columns are known to have a date beside them. Dates without a time
-        zone are in `zone`. Without columns and formats there is one time, 0.
+        A column of datetimes is read as `iso`, whatever its format; whether times of day in another
+        column have a date beside them is told by the stated formats alone. Dates without a time
+        zone are in `zone`, or UTC if that is "". Without columns and formats there is one time, 0.
     form : TextForm
         The section `[text]`: how numbers are written.
 
