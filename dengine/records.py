@@ -214,9 +214,10 @@ class TraceSpec:
     def completed(self, other: "TraceSpec | None") -> "TraceSpec":
         """Return a copy whose unknown rate, units and columns are taken from another `TraceSpec`.
 
-        A `TraceSpec` says what traces look like. What this one states is kept; a unit is taken for
-        each channel that has none; `limit` and `fit` are never taken. It is returned unchanged if
-        `other` is None or has another number of samples or channels.
+        A `TraceSpec` says what traces look like; its columns are the channels' names. What this one
+        states is kept; a unit is taken for each channel that has none; `limit` (the sensor's range)
+        and `fit` (what happens to a trace of another length) are never taken. It is returned
+        unchanged if `other` is None or has another number of samples or channels.
         """
         if other is None or (self.samples, self.channels) != (other.samples, other.channels):
             return self

@@ -179,9 +179,10 @@ def fit_starts_afresh(reducer: Any) -> None:
 def any_length_and_several_channels_work(reducer: Any) -> None:
     """Assert that traces of other lengths, and of three channels, can be trained on and embedded.
 
-    The shapes (channels x samples) are 1 x 152, 1 x 800 and 3 x 90. `train` must return a point for
-    each trace, and these and the points of `embed` must be finite. For each shape a clone is
-    trained on test traces, so `reducer` may be unfitted and stays unchanged.
+    A reducer maps traces to points. The shapes (channels x samples) are 1 x 152, 1 x 800 and 3 x
+    90. `train` must return a point for each trace, and these and the points of `embed` must be
+    finite. For each shape a clone is trained on test traces, so `reducer` may be unfitted and stays
+    unchanged.
     """
     for channels, samples in SHAPES:
         X, y = toy_traces(70, samples, channels)

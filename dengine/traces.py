@@ -321,9 +321,10 @@ class TraceGate(nn.Module):
 def check_rate(force_limits: Sequence[ForceLimits], trace_spec: TraceSpec | None) -> None:
     """Raise SettingError if a force limit is in seconds and the rate of the traces is unknown.
 
-    Force limits are an operator's limits of a channel within a stretch of time, or of the values of
-    another channel, `along`; the latter need no rate. If `trace_spec` is None, the rate is unknown,
-    too: the `TraceSpec` will be inferred from the first trace, which does not tell its rate.
+    Force limits are an operator's limits of a channel within a stretch of time, which is always in
+    seconds, or of the values of another channel, `along`; only the latter need no rate. If
+    `trace_spec` is None, the rate is unknown, too: the `TraceSpec` will be inferred from the first
+    trace, which does not tell its rate.
     """
     in_seconds = [limits for limits in force_limits if limits.along is None]
     if in_seconds and (trace_spec is None or trace_spec.rate_hz is None):

@@ -71,11 +71,11 @@ def load_dataset(
     DataError
         If the description is missing or has a key whose value is `?` (the message says what to
         type), if the source or a channel does not exist, if no recording is left, if `samples` is
-        below 1, or if the traces are shorter than `samples`, or longer and resampled (`fit`), since
-        these are not cut. Also if none of the files can be read, a file that lists the labels
-        cannot be read, the rows of a store contradict its ledger (the chain of hashes over them),
-        or the traces and labels do not fit together (`make_dataset`), like those of a table of
-        `Dataset.to_frame` that was changed.
+        below 1, or if the traces are shorter than `samples`, or longer and resampled (the field
+        `fit` of the data set is "resample"), since these are not cut. Also if none of the files can
+        be read, a file that lists the labels cannot be read, the rows of a store contradict its
+        ledger (the chain of hashes over them), or the traces and labels do not fit together
+        (`make_dataset`), like those of a table of `Dataset.to_frame` that was changed.
     SettingError
         If `windows.trigger` of the description, which cuts long recordings, is malformed, or if
         `channels` is given for a data set of which `Dataset.spec` cannot be made.
@@ -256,8 +256,8 @@ def _from_own_frame(frame: Any, name: str = "table") -> Dataset:
     """Return the data set of a DataFrame that `Dataset.to_frame` made; `name` becomes its name.
 
     The columns of samples are those that `to_frame` wrote; other columns, beside label, part and
-    cause, are ignored. Raises DataError if `make_dataset` refuses its arrays, if it has no row or
-    lacks a column of samples or `label`, or if samples are no numbers.
+    cause (why the part failed), are ignored. Raises DataError if `make_dataset` refuses its arrays,
+    if it has no row or lacks a column of samples or `label`, or if samples are no numbers.
     """
     about = {**frame.attrs[OWN]}
     words = frame[frame.columns.intersection(["part", "cause"])].astype(str)

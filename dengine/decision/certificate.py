@@ -369,9 +369,10 @@ class Certificate:
 
     @property
     def sentence_on_rejects(self) -> str:
-        """The claim about rejected parts as one sentence: how many of them were good at most.
+        """The claim about rejected parts as one sentence: what share of them was good at most.
 
-        If nothing can be claimed, it says so, and why.
+        It also names the confidence, and the tolerance or, if the policy decides by prices, the
+        share up to which rejecting pays. If nothing can be claimed, it says so, and why.
         """
         return self._claim(
             self.rejected,

@@ -306,12 +306,12 @@ def _discriminants(gate: NoveltyGate, x: Tensor, plain: Tensor, used: Tensor) ->
     """Return Fisher's discriminants of traces and their D distortions, float32 (P, D), P features.
 
     Column j separates the traces x (n, C, T) from their j-th distortion (`_distort`); it is for
-    features that are not standardised. `plain` (n, P), float64, are the traces' features by `gate`.
-    Only features that `used` (P,), bool, marks are read; the rows of the others are 0. Of the
-    traces fewer than 250, evenly spaced, are distorted, for the mean difference. The covariance is
-    that of all traces, plus the identity times (number of used features / n)**2, because the
-    covariance of few traces is not known, plus half of the covariance of the distorted traces.
-    Inside, standardised features are clipped at 6 deviations.
+    features that are not standardised. `plain` (n, P), float64, are the traces' features by `gate`,
+    the module that tests whether a trace is novel. Only features that `used` (P,), bool, marks are
+    read; the rows of the others are 0. Of the traces fewer than 250, evenly spaced, are distorted,
+    for the mean difference. The covariance is that of all traces, plus the identity times (number
+    of used features / n)**2, because the covariance of few traces is not known, plus half of the
+    covariance of the distorted traces. Inside, standardised features are clipped at 6 deviations.
     """
     offset, gain = (used * values for values in _standardise(plain))
     z = torch.addcmul(offset, plain, gain).clamp(-6.0, 6.0)

@@ -285,12 +285,14 @@ class Policy:
         return 1.0 if self.stops == "all" else self.audit_rate or 1.0
 
     def rule(self) -> DecisionRule:
-        """Make the decision rule, which turns bounds into actions; it has learned nothing yet.
+        """Make the decision rule, which turns bounds of a success probability into actions.
 
-        Its class is the one that `RULES` names for `guarantee` and `stops`, or the user's own if
-        `guarantee` is `module:Class`, which is imported. The class gets alpha, lower_bound and
-        interval. `PooledRule`, `PricedRule` and their subclasses also get `inclusion_probability`
-        (the probability that an outcome is known), priced ones `tolerances` as well.
+        It has learned nothing yet. Its class is the one that `RULES` names for `guarantee` (what is
+        promised about decisions) and `stops` (whether every bad accepted part is reported), or the
+        user's own if `guarantee` is `module:Class`, which is imported. The class gets alpha,
+        lower_bound and interval. `PooledRule`, `PricedRule` and their subclasses also get
+        `inclusion_probability` (the probability that an outcome is known), priced ones `tolerances`
+        (the shares of wrong accepts and rejects that are allowed) as well.
 
         Returns
         -------

@@ -422,7 +422,7 @@ class Corrections:
         rate_counts = is_sorting and policy.inclusion_probability != old_probability
         starts_anew = not is_baseline and (rate_counts or any(name in changes for name in SCORING))
         live = self._live
-        since = 0 if live.answering is None else live.next_version
+        since = live.next_version
         evidence = present.evidence
         if starts_anew:
             evidence = EvidenceWindow(since, SAFE_MODES.index(live.newest.safe_mode))

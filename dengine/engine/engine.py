@@ -218,15 +218,17 @@ class DataEngine(AbstractContextManager["DataEngine"]):
 
         `template` is the untrained model, and the arguments from `executor` to `on_safe_mode` are
         those of `DataEngine`. One of the objects is the outbox, which records decisions and labels
-        on the local disk (in a journal) and then in the store. It claims the robot cell, so that no
-        other engine may run on it, writes what an earlier process left in the journal to the store,
-        and checks the store (`open_outbox`); version and labels are not restored yet (`_resume`).
-        When the engine is garbage-collected or the program ends, `_close_forgotten` closes the
-        outbox, and with it a store that is not in memory. Without an executor, and unless the
-        engine only reads (`reading`), the modules that a retrain imports are loaded; what that
-        raises, for a reducer of the user's, is raised. Limits this thread to one torch thread.
-        Raises SettingError for force limits (an operator's limits of the signal) in seconds at an
-        unknown rate, and StoreError if another engine owns the cell or the store cannot be used.
+        in the store, and before that in a journal on the local disk, unless the engine only reads
+        (`reading`) or the store is in memory. With a journal it claims the robot cell, so that no
+        other engine may run on it, and writes what an earlier process left in the journal to the
+        store. It checks the store in any case (`open_outbox`); version and labels are not restored
+        yet (`_resume`). When the engine is garbage-collected or the program ends,
+        `_close_forgotten` closes the outbox, and with it a store that is not in memory. Without an
+        executor, and unless the engine only reads, the modules that a retrain imports are loaded;
+        what that raises, for a reducer of the user's, is raised. Limits this thread to one torch
+        thread. Raises SettingError for force limits (an operator's limits of the signal) in seconds
+        at an unknown rate, and StoreError if another engine owns the cell or the store cannot be
+        used.
         """
         recipe = settings.recipe
         check_rate(recipe.policy.force_limits, settings.trace)
@@ -487,9 +489,9 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         the database does not take stay in the journal, a file on the local disk, and the next
         engine writes them. Records that the disk does not take are given up, and an error is
         logged; no call has said that they are on disk. If the disk hangs, the store stays open, and
-        no other engine can own the cell until the process ends. With `replaying=True` this waits
-        for the disk and the database without a time limit. A store in memory stays open. Raises
-        StoreError while another thread uses the engine.
+        no other engine can own the cell until the process ends. An engine that replays recordings
+        (`replaying=True`) waits for the disk and the database without a time limit. A store in
+        memory stays open. Raises StoreError while another thread uses the engine.
         """
         with self._exclusive:
             if self._outbox.is_usable:
@@ -521,16 +523,18 @@ class DataEngine(AbstractContextManager["DataEngine"]):
     ) -> Decision:
         """Decide whether the part of a trace is verified, accepted or rejected; record this.
 
-        Before that, a version that the executor has trained is taken one step further (the steps
-        are test, store, put in force; in a product, robot cells that share labels and versions, all
-        are taken, after what the other cells stored, and the call waits for the store). Accepted
-        parts without a report are confirmed as good with `Policy(stops="all")`, under which every
-        bad one is reported in time; else they are counted as unreported. If the decision rule was
-        updated with a wrong outcome, it is put right, as by `flush`. After the decision, checks
-        without a report for too long (`Policy.label_within`) update the rule as wrong decisions;
-        then, if a safe mode (after an alarm, parts are verified until new outcomes are good) began
-        or ended, an event (a row in the store's log) is recorded, and `on_safe_mode` is called. For
-        an id that has a decision nothing of this is done, and that decision is returned.
+        Before that, a version that the executor (a pool beside the engine) has trained is taken one
+        step further (the steps are test, store, put in force; in a product, robot cells that share
+        labels and versions, all are taken, after what the other cells stored, and the call waits
+        for the store). Accepted parts without a report are confirmed as good with
+        `Policy(stops="all")`, under which every bad one is reported in time; else they are counted
+        as unreported. If a report has replaced an outcome that the decision rule was updated with,
+        the rule is put right, as by `flush`, which may retrain the model. After the decision,
+        checks without a report for too long (`Policy.label_within`) update the rule as wrong
+        decisions; then, if a safe mode (after an alarm, parts are verified until new outcomes are
+        good) began or ended, an event (a row in the store's log) is recorded, and `on_safe_mode` is
+        called. For an id that has a decision nothing of this is done, and that decision is
+        returned.
 
         Parameters
         ----------
@@ -566,13 +570,13 @@ class DataEngine(AbstractContextManager["DataEngine"]):
             samples, an id that belongs to another trace, and an invalid part number.
         SettingError
             For a first trace that the policy's force limits (an operator's limits of the signal) do
-            not fit, and, while settings are saved, for a `TraceSpec` that contradicts that of
-            another robot cell of the product.
+            not fit, and, once the store takes the new settings, for a `TraceSpec` that contradicts
+            that of another robot cell of the product.
         ReportError
             For an invalid id, and with `timed_out` for none.
         StoreError
-            For an engine that is closed, was opened for reading or before a fork, and, unless
-            `timed_out`, for one that is in use by another thread.
+            For an engine that is closed, was opened for reading or before the process was forked,
+            and, unless `timed_out`, for one that is in use by another thread.
         """
         self._outbox.check_usable()
         if timed_out:
@@ -811,11 +815,11 @@ class DataEngine(AbstractContextManager["DataEngine"]):
             True: a version that is already trained is first put in force or dropped, and a training
             that is not done is discarded. With an executor the first such call also loads the
             modules that a retrain imports; if that fails, it is logged. False: begin to retrain in
-            the executor, and return None; `poll` brings it to its end. If a retrain is under way,
-            nothing is begun, and a trained version is taken one step further (in a product, all
-            steps); if the executor cannot begin yet, `poll` or `report` begins it.
-            Without an executor, or if the executor takes no work because it died or hangs, the
-            retrain runs in this thread, and its report is returned.
+            the executor, and return None; `poll` brings it to its end. If a retrain is under way, a
+            trained version is first taken one step further (in a product, all steps), and another
+            retrain is begun only if that was the last step. If the executor cannot begin yet,
+            `poll` or `report` begins it. Without an executor, or if the executor takes no work
+            because it died or hangs, the retrain runs in this thread, and its report is returned.
 
         Returns
         -------
@@ -1038,15 +1042,18 @@ def _new_settings(
 ) -> tuple[EngineSettings, EngineModel]:
     """Return the settings of a new engine, and the untrained model that they describe.
 
-    A recipe holds all settings. `given` holds the settings that the caller passed beside `recipe`,
-    by name. They replace those of the recipe; a setting of None counts as not given. For a `model`
-    that the user handed in, without a recipe, the other settings are those of the default recipe,
-    but `retrain_every` is that of `Reducer`, not of the reducer conv. Raises SettingError if
-    `reducer`, or a setting in `given`, has no effect on such a model; those in `recipe` are not
-    refused. Raises it also for settings that are out of range or contradict each other, if the
-    reducer or the decision rule cannot be made, for a `model` that `BaselineAdapter` refuses, and
-    if the training window (the number of newest labels) is smaller than the model's `min_traces`.
-    Other errors of the constructor of a user's class are raised as they are.
+    A recipe holds all settings. Without a `recipe` it is that of `reducer`, which maps traces to
+    points, or of the reducer conv; `seed` and `trace` are kept as given. `given` holds the settings
+    that the caller passed beside `recipe`, by name. They replace those of the recipe; a setting of
+    None counts as not given. For a `model` that the user handed in, without a recipe, the other
+    settings are those of the default recipe, but `retrain_every` (new labels between two retrains)
+    is that of the class `Reducer`, not that of conv. Raises SettingError if `reducer`, or a setting
+    in `given`, has no effect on such a model; those in `recipe` are not refused. Raises it also for
+    settings that are out of range or contradict each other, if the reducer or the decision rule
+    (which turns bounds into an action) cannot be made, for a `model` that is a class, lacks a
+    method of `Model` or is one of dengine, and if the training window (the number of newest labels)
+    is smaller than the model's `min_traces`, the number of labelled traces that its first training
+    needs. Other errors of the constructor of a user's class are raised as they are.
     """
     if model is not None:
         check_model_settings(reducer, given)

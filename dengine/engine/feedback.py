@@ -146,7 +146,9 @@ class Feedback:
         With `Policy(stops="all")`, under which a bad part would have stopped the line, each part
         counts as good: the decision rule and the references (labelled points that new traces are
         compared with) learn it now, and its label, CONFIRMED, is recorded without waiting for the
-        disk, and counts as new. An exception of rule or model is logged, not raised, and a part
+        disk, counts as new, and enters the training window (the newest labelled traces); in a
+        product (robot cells that share labels) it enters it later, from the store. An exception of
+        rule or model is logged, not raised; after one of the rule every part is verified. A part
         from before the present rule began does not update the rule. With "some" the parts are only
         counted, and nothing is learned. Either way they wait for an outcome no longer.
         """
@@ -165,9 +167,9 @@ class Feedback:
         done. If the decision has a label already, ReportError is raised, with one exception: an
         accepted part that was confirmed as good, by a report or by the next decision
         (`Policy(stops="all")`), may be reported as bad, because it stopped the line. Such a line
-        stop is recorded, and learned later, as a correction. The attribute `remedy` is set if the
-        decision rule must be rebuilt, which is not done here. An exception of rule or model is
-        logged, not raised.
+        stop is recorded, and must be learned later, as a correction. The attribute `remedy` says
+        so, and also if the decision rule must be rebuilt, because it had counted the check as
+        overdue; neither is done here. An exception of rule or model is logged, not raised.
 
         A label that is learned counts as new and enters the training window (the newest labelled
         traces); in a product (robot cells that share labels and versions) it enters the window

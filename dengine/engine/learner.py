@@ -467,10 +467,10 @@ class Learner:
         only the report is stored, and the previous version stays in force.
 
         Yields after each step: None, or, if the store has not done its part yet, a function that
-        waits for it. If the store has not begun to commit the version within the outbox's `limit`
-        (seconds that a call waits for the store), the step itself waits for it. Raises StoreError
-        if the version cannot be stored. The functions that it yields raise StoreError if the labels
-        or the version cannot be stored.
+        waits for it. If the store has not begun to commit the version within the seconds that a
+        call waits for the store (`limit` of the outbox, which writes to it), the step itself waits
+        for it. Raises StoreError if the version cannot be stored. The functions that it yields
+        raise StoreError if the labels or the version cannot be stored.
         """
         candidate.check()
         yield None
@@ -597,14 +597,15 @@ class Learner:
         change of a label. If there is a newer version or correction, or with `with_labels`, this
         cell's labels are stored first, and the labels of all cells are read into the training
         window (the newest labelled traces) at the end. What is read is checked against the ledger
-        (the store's hash chain); a difference sets the outbox's `integrity_error`, after which
-        every part is verified. A version that cannot be used is logged, and the present version
-        stays in force (`Peers.put_in_force`). A correction, or a newer version that a rollback
-        pinned (no retrain may replace it), discards a training under way in the executor. A
-        correction changes one of the model's references (labelled points that new traces are
-        compared with); a model that cannot do so is not retrained here. After a newer version the
-        new labels are counted from those that it knows. Nothing happens in a cell without a
-        product. Raises StoreError if the store is unavailable.
+        (the store's hash chain); a difference sets the `integrity_error` of the outbox (by which
+        the engine reaches its store), after which every part is verified. A version that cannot be
+        used is logged, and the present version stays in force (`Peers.put_in_force`). A correction,
+        or a newer version that a rollback pinned (no retrain may replace it), discards a training
+        under way in the executor (a pool in which retrains run beside the engine). A correction
+        changes one of the model's references (labelled points that new traces are compared with); a
+        model that cannot do so is not retrained here. After a newer version the new labels are
+        counted from those that it knows. Nothing happens in a cell without a product. Raises
+        StoreError if the store is unavailable.
         """
         peers = self._peers
         if peers is None:
@@ -649,11 +650,12 @@ class Learner:
         then (`end_training`). If the next training does not start from the model in force, because
         labels were forgotten (withdrawn), its features are computed in advance
         (`_precompute_other_start`). The store is checked against its ledger (its hash chain); a
-        difference sets the outbox's `integrity_error`, after which every part is verified. A
-        damaged trace is reported by an event (a row in the store's log). With no new correction the
-        window is read and the rule rebuilt, too; a baseline (a model that the user handed in) is
-        then retrained all the same. Raises StoreError if the store is unavailable, and what
-        `retrain` raises, or, for a pinned model that is fitted again, `roll_back`.
+        difference sets `integrity_error` of the outbox, through which the engine writes to the
+        store, after which every part is verified. A damaged trace is reported by an event (a row in
+        the store's log). With no new correction the window is read and the rule rebuilt, too; a
+        baseline (a model that the user handed in) is then retrained all the same. Raises StoreError
+        if the store is unavailable, and what `retrain` raises, or, for a pinned model that is
+        fitted again, `roll_back`.
         """
         self._outbox.check_integrity(0)  # the rule is rebuilt from all of it
         corrections = self._store.corrections.after(self.live.corrected_to)
@@ -722,12 +724,13 @@ class Learner:
         before: checking the store against its ledger (its hash chain), reading the version,
         restoring it, and adding the later labels, up to the capacity of the training window (the
         newest labelled traces), as its references (labelled points that new traces are compared
-        with). A difference from the ledger sets the outbox's `integrity_error`, after which every
-        part is verified, and a damaged trace is reported by an event (a row in the store's log).
-        Once it is in force, new labels count from zero, since the version knows all labels until
-        now. A retrain that was requested before is not begun any more. If the next training starts
-        from another model, a thread begins to precompute for it; without an executor this call
-        waits for the thread.
+        with). A difference from the ledger sets the `integrity_error` of the outbox (by which the
+        engine reaches its store), after which every part is verified, and a damaged trace is
+        reported by an event (a row in the store's log). Once it is in force, new labels count from
+        zero, since the version knows all labels until now. A retrain that was requested before is
+        not begun any more. If the next training starts from another model, a thread begins to
+        precompute for it; without an executor (a pool in which retrains run beside the engine) this
+        call waits for the thread.
 
         A baseline (a model that the user handed in), which is fitted again, gets the labels as they
         count now, since it cannot take a label back. The model takes over the decision rule in

@@ -402,13 +402,14 @@ class LiveModel:
     def get_state(self, model: EngineModel, trained_on: TrainedOn) -> State:
         """Return the arrays by name with which the store can restore a model as a version.
 
-        They hold the model with its references and its decision rule (of a baseline, a model that
-        the user handed in, nothing), all fields of `trained_on` (which labels it was trained on),
-        the number of the newest correction of a label that is applied, and the number of the newest
-        decision that was examined for an overdue check (not reported in time). If the rule is
-        stale, because it missed an update, the array `rule_is_stale` takes its place. If an overdue
-        check counts, there is the array `includes_overdue`: an engine that opens the store then
-        rebuilds the rule, and does not take the stored one. Some arrays are views.
+        They hold the model with its references (labelled points) and its decision rule (of a
+        baseline, a model that the user handed in, nothing), all fields of `trained_on` (which
+        labels it was trained on), the number of the newest correction of a label that is applied,
+        and the number of the newest decision that was examined for an overdue check (not reported
+        in time). If the rule is stale, because it missed an update, the array `rule_is_stale` takes
+        its place. If an overdue check counts, there is the array `includes_overdue`: an engine that
+        opens the store then rebuilds the rule, and does not take the stored one. Some arrays are
+        views.
         """
         state = model.get_state() | trained_on.to_state()
         state["corrected_to"] = np.array(self.corrected_to)

@@ -383,10 +383,10 @@ def check_imports(recipe: Recipe, store: str, allow_import: bool | Collection[st
     """Raise ImportRefusedError if a stored recipe names a class that may not be imported.
 
     A recipe has the settings of an engine. Whoever writes to the store could otherwise run code
-    here. Only classes of the user are checked, the reducer's and the decision rule's
-    (`Recipe.user_classes`). With `allow_import` True any of them is allowed, with False none; else
-    it holds the names of the allowed ones, `module:Class`. `store` is the store's name in the
-    message.
+    here. Only classes of the user are checked, those of the reducer (the model that embeds traces)
+    and of the decision rule (`Recipe.user_classes`). With `allow_import` True any of them is
+    allowed, with False none; else it holds the names of the allowed ones, `module:Class`. `store`
+    is the store's name in the message.
     """
     if allow_import is True:
         return

@@ -302,14 +302,15 @@ class Retrainer:
         """Train a successor of the current model in this thread, and return the outcome.
 
         The model decides whether a successor starts from the weights of the current model or from
-        scratch. It is trained on the training window as it is now. The time budget, or `max_steps`
-        optimiser steps, may end the training early; it is accepted all the same. `begin` is when
-        work on the retrain began, in seconds by the clock. It is only put in the outcome; the time
-        budget counts from the start of the training. The current model is not changed. If the
-        training fails, the outcome has no model, and nothing is raised; but what copying a user's
-        model raises is raised. How long the training took for its last step and the work after it
-        is remembered: the longest of the newest 20 is reserved in the time budget of the next, but
-        at least 30 % and at most 70 % of it. This thread then has one torch thread.
+        scratch. It is trained on the training window (the newest labelled traces) as it is now. The
+        time budget (the seconds of a retrain), or `max_steps` optimiser steps, may end the training
+        early; it is accepted all the same. `begin` is when work on the retrain began, in seconds by
+        the clock. It is only put in the outcome; the time budget counts from the start of the
+        training. The current model is not changed. If the training fails, the outcome has no model,
+        and nothing is raised; but what copying a user's model raises is raised. How long the
+        training took for its last step and the work after it is remembered: the longest of the
+        newest 20 is reserved in the time budget of the next, but at least 30 % and at most 70 % of
+        it. This thread then has one torch thread.
         """
         trained = train_candidate(
             current.successor(),
@@ -441,10 +442,11 @@ class Retrainer:
     def _replace_executor(self) -> None:
         """Restart the executor if it is a `RestartableExecutor`; otherwise go on without it.
 
-        A restart ends what the executor works on. If it raises OSError, that is logged, and the
-        next retrain tries again. Any other executor is set to None, which is logged; but if it
-        still works on a discarded training (one that was given up), it is kept, and used again once
-        that is done.
+        The executor is a pool in which retrains run beside the engine; without it they run in the
+        engine's own thread. A restart ends what it works on. If it raises OSError, that is logged,
+        and the next retrain tries again. Any other executor is set to None, which is logged; but if
+        it still works on a discarded training (one that was given up), it is kept, and used again
+        once that is done.
         """
         executor = self.executor
         if isinstance(executor, RestartableExecutor):

@@ -376,9 +376,10 @@ def candidates(
     certain of), these two get an audit rate of 5 %, because they need outcomes of accepted parts.
 
     LBs come the lowest first. If `lower_bounds` is empty, they are taken around break-even, at
-    which 1 - LB is check / escape: 1 - LB is that ratio times 0.5, 1, 2, 4, 8 and 16 for "local"
-    (or the user's own rule), times 1, 2 and 4 for "pooled", each product rounded to two
-    significant digits. LBs below 80 % are left out; if all are below it, 80 % is the only LB.
+    which 1 - LB is the price of a check divided by that of a bad accepted part: 1 - LB is that
+    ratio times 0.5, 1, 2, 4, 8 and 16 for "local" (or the user's own rule), times 1, 2 and 4 for
+    "pooled", each product rounded to two significant digits. LBs below 80 % are left out; if all
+    are below it, 80 % is the only LB.
     """
     policy = contender.recipe.policy
 
@@ -465,19 +466,19 @@ def cost_curve(
         What a check, a bad part that is accepted and a good part that is rejected cost, in one
         unit.
     recipe : object, default "conv"
-        Anything `Contender.load` takes. The guarantee of its policy (the rule by which it decides)
-        is replaced, with alpha and lower_bound under "local", with lower_bound under "pooled", and
-        with the prices under "cost". Its other settings stay, but shadow mode, in which every part
-        is verified, is turned off. If its policy has no audits (checks of parts that the model is
-        certain of) and stops="some" (not every bad accepted part is reported), the guarantees
-        "pooled" and "cost" get an audit rate of 5 %, because they need outcomes of accepted parts.
-        A rule of the user's own keeps its guarantee and gets alpha and lower_bound. A baseline, a
-        method to compare with, plays "local" alone.
+        Anything `Contender.load` takes. The guarantee of its policy (the rule by which it decides,
+        see `Policy`) is replaced, with alpha and lower_bound under "local", with lower_bound under
+        "pooled", and with the prices under "cost". Its other settings stay, but shadow mode, in
+        which every part is verified, is turned off. If its policy has no audits (checks of parts
+        that the model is certain of) and stops="some" (not every bad accepted part is reported),
+        the guarantees "pooled" and "cost" get an audit rate of 5 %, because they need outcomes of
+        accepted parts. A rule of the user's own keeps its guarantee and gets alpha and lower_bound.
+        A baseline, a method to compare with, plays "local" alone.
     alphas : sequence of float, default (0.1,)
-        Values to try under the guarantee "local", or under a rule of the user's own.
+        Error levels to try under the guarantee "local", or under a rule of the user's own.
     lower_bounds : sequence of float
-        Values to try; by default values around 1 - check / escape that the number of recordings
-        allows.
+        Success probabilities that accepted parts must have, to try; by default values around 1 -
+        check / escape that the number of recordings allows.
     repeats : int, default 4
         Fresh shuffles that the last policies play, at least 2.
     seed : int, default 0
@@ -495,7 +496,7 @@ def cost_curve(
     -------
     curve : CostCurve
         Its `rows` say what a part costs under each of the last policies. Its `policy` is the
-        choice; None if no policy pays or may pay.
+        choice; None if even the best costs no less than checking every part.
 
     Raises
     ------
@@ -551,8 +552,9 @@ def find_policy(
     played. The result is then computed from the fresh shuffles that each of the last policies has
     finished, if there are two or more. Otherwise it is computed from the earlier shuffles, with its
     field `fresh` False; without two of these it is None. `costs` holds the three prices, and
-    `contender` is what `Contender.load` makes of the recipe; the other parameters are those of
-    `cost_curve`. Raises SettingError like `cost_curve`, and what `play` raises.
+    `contender` is what `Contender.load` makes of the recipe: dengine with these settings, or a
+    method to compare with; the other parameters are those of `cost_curve`, of which `alphas` and
+    `lower_bounds` are values to try. Raises SettingError like `cost_curve`, and what `play` raises.
     """
     _check_search(data, costs, repeats)
     n_cycles = len(data) if cycles is None else cycles

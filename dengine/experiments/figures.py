@@ -146,16 +146,16 @@ def save(figure: Figure, path: str | Path, dpi: int = 120, force: bool = False) 
 def embedding_map(replay: Replay, title: str = "") -> Figure:
     """Draw the embeddings of a replay's newest 300 parts, and return the figure.
 
-    The left panel shows which parts were good and bad, the right one what was decided. A point is
-    the mean over the embedding spaces (one for each fold of the cross-fitting), in its first two
-    dimensions (0 for a second one that is missing), as it was at the decision; later retrains do
-    not move it. Parts that no model embedded, or whose embedding has another number of dimensions
-    than the replay's newest, are left out, on the left also parts of unknown truth. A circle with
-    the recipe's radius, within which labels are counted, surrounds the newest point. Without any
-    point a text says so. If the recipe's reducer gives an embedding that is never scaled
-    (`has_own_unit`), its first dimension is taken for a probability, and the second says little:
-    the vertical axis is then the cycle, and two vertical lines take the place of the circle. Raises
-    SettingError if the reducer's class cannot be imported.
+    A replay is a recorded run of a robot cell. The left panel shows which parts were good and bad,
+    the right one what was decided. A point is the mean over the embedding spaces (one for each fold
+    of the cross-fitting), in its first two dimensions (0 for a second one that is missing), as it
+    was at the decision; later retrains do not move it. Parts that no model embedded, or whose
+    embedding has another number of dimensions than the replay's newest, are left out, on the left
+    also parts of unknown truth. A circle with the recipe's radius, within which labels are counted,
+    surrounds the newest point. Without any point a text says so. If the recipe's reducer gives an
+    embedding that is never scaled (`has_own_unit`), its first dimension is taken for a probability,
+    and the second says little: the vertical axis is then the cycle, and two vertical lines take the
+    place of the circle. Raises SettingError if the reducer's class cannot be imported.
 
     Parameters
     ----------

@@ -109,10 +109,10 @@ class Contender:
         ----------
         recipe : Contender, str or object
             A contender is returned as it is. A baseline's name gives the baseline with its default
-            settings, in a default `Recipe` whose `retrain_every` is that of the class `Reducer`.
-            Otherwise anything that `Recipe.load` takes. A contender from a TOML file has the name
-            of the file without its suffix, and one from a name in `RECIPES` has this name; any
-            other has `Recipe.name`, so `Recipe` objects with one reducer have one name.
+            settings, in a default `Recipe` whose `retrain_every` is the default of the base class
+            `Reducer`. Otherwise anything that `Recipe.load` takes. A contender from a TOML file has
+            the name of the file without its suffix, and one from a name in `RECIPES` has this name;
+            any other has `Recipe.name`, so `Recipe` objects with one reducer have one name.
 
         Raises
         ------
@@ -280,7 +280,7 @@ class Replay:
         return np.asarray(self.reason == Reason.OUTSIDE)
 
     def to_frame(self) -> "pd.DataFrame":
-        """Return a DataFrame with a row for each cycle, numbered from 1.
+        """Return a DataFrame with a row for each cycle, which is one part, numbered from 1.
 
         Its columns are the fields that have a value for each cycle, and one for each dimension of
         `position`, the embedding: embedding_1, embedding_2, ... The index is named "cycle".
@@ -321,9 +321,9 @@ class Replay:
             first_cycle and last_cycle, counted from 1. verified_share, NaN without cycles. Numbers
             of cycles: verified, accepted, rejected (by the model), false_positive (accepted and
             known to be bad), false_negative (rejected and known to be good), novel (verified
-            because the trace is unlike all learned ones), safe_mode (after which every part is
-            verified, because of an alarm), outside (the trace left an operator's force limits), and
-            stops (an accepted part was bad and stopped the line).
+            because the trace is unlike all learned ones), safe_mode (it was in force at the end of
+            the cycle: every part is verified, because of an alarm), outside (the trace left an
+            operator's force limits), and stops (an accepted part was bad and stopped the line).
         """
         begin, end, _ = cycles.indices(len(self))
         counts = {name: int(getattr(self, name)[cycles].sum()) for name in COUNTED}
@@ -349,20 +349,21 @@ class Replay:
         Returns
         -------
         row : dict
-            The settings: recipe, interval, alpha, lower_bound, guarantee, stops, confirm (whether
-            the cell confirmed accepted good parts), seed. cycles, their number. Numbers of cycles:
-            accepted, rejected (by the model), false_positive (accepted and bad), false_negative
-            (rejected and good), novel (verified because the trace is unlike all learned ones),
-            safe_mode (after which every part is verified, because of an alarm), outside (the trace
-            left an operator's force limits). certain, the number of parts that the model accepted
-            or rejected; first_certain, the cycle of the first of them, counted from 1. precision
-            and npv, the shares of right decisions among the accepted and the rejected parts, and
-            accuracy, among both. retrains, their number; retrains_dropped, the number of those
-            whose model was not put in use; dropped, the reason of the last of these, or "".
-            retrain_p50_s and retrain_max_s, the median and largest time of a retrain; decide_p50_us
-            and decide_p99_us, the median and 99th percentile of a decision's, in µs; seconds, those
-            of the replay. saved_s, the seconds of checks that the certain parts saved; and net_s,
-            which is saved_s minus the cost of errors, in seconds, by the defaults of `Costs`.
+            The settings: recipe; interval, alpha, lower_bound, guarantee and stops of its `Policy`;
+            confirm (whether the cell confirmed accepted good parts), seed. cycles, their number.
+            Numbers of cycles: accepted, rejected (by the model), false_positive (accepted and bad),
+            false_negative (rejected and good), novel (verified because the trace is unlike all
+            learned ones), safe_mode (after which every part is verified, because of an alarm),
+            outside (the trace left an operator's force limits). certain, the number of parts that
+            the model accepted or rejected; first_certain, the cycle of the first of them, counted
+            from 1. precision and npv, the shares of right decisions among the accepted and the
+            rejected parts, and accuracy, among both. retrains, their number; retrains_dropped, the
+            number of those whose model was not put in use; dropped, the reason of the last of
+            these, or "". retrain_p50_s and retrain_max_s, the median and largest time of a retrain;
+            decide_p50_us and decide_p99_us, the median and 99th percentile of a decision's, in µs;
+            seconds, those of the replay. saved_s, the seconds of checks that the certain parts
+            saved; and net_s, which is saved_s minus the cost of errors, in seconds, by the defaults
+            of `Costs`.
 
         Raises
         ------

@@ -274,7 +274,8 @@ def write_csv(frame: pd.DataFrame, path: str | Path, force: bool = False) -> Pat
     Raises
     ------
     OutputError
-        The file exists and `force` is not set, or it cannot be written.
+        The file exists and `force` is not set, it is a database or a link, or it cannot be
+        written.
     """
     return write_output(
         path,

@@ -233,9 +233,10 @@ def describe(source: Exportable) -> Metadata:
     the traces), the policy (with a user's rule as `module:Class`), the factor of the limit beyond
     which a trace counts as novel, the numbers of embedding spaces and of coordinates, the
     references (labelled points: their number, their largest number and their SHA-256), the order of
-    the fields of a decision, of actions, reasons and safe modes, the audit rate (share of parts
-    that are checked although the model is certain), the seed and the recipe (all settings).
-    `metadata_of` reads it without loading the model.
+    the fields of a decision, of actions, reasons and safe modes (states after an alarm, in which
+    parts are verified), the audit rate (share of parts that are checked although the model is
+    certain), the seed and the recipe (all settings). `metadata_of` reads it without loading the
+    model.
     """
     model = source.model
     index = model.index

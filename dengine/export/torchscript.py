@@ -126,11 +126,11 @@ def export_torchscript(
     ------
     ExportError
         If nothing was trained yet, for a baseline (a model that was handed in to the engine), if
-        `trace` has another shape than the model's traces, if the reducer, the confidence interval
-        or the decision rule cannot be compiled, if the compiled decision and the reducer map one of
-        up to eight labelled traces to different points, if the rule is stale, because an update of
-        it failed, if the store was changed from outside (its rows do not fit their checksums), and
-        if the key cannot be read or has fewer than 16 bytes.
+        `trace` has another shape than the model's traces, if the reducer (which maps traces to
+        points), the confidence interval or the decision rule cannot be compiled, if the compiled
+        decision and the reducer map one of up to eight labelled traces to different points, if the
+        rule is stale, because an update of it failed, if the store was changed from outside (its
+        rows do not fit their checksums), and if the key cannot be read or has fewer than 16 bytes.
     SettingError
         If the engine's force limits do not fit `trace`.
     OutputError

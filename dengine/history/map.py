@@ -83,7 +83,8 @@ def part_map(store: "SqlStore", recipe: Recipe, version: int) -> PartMap:
     ----------
     store : SqlStore
     recipe : Recipe
-        With the radius and the reducer, whose class is imported if it is a `module:Class`.
+        With the radius within which labels count, and the reducer, which maps traces to points; the
+        class of the reducer is imported if it is a `module:Class`.
     version : int
         The model version. 0 stands for the time before the first version: the map is empty.
 

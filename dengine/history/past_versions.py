@@ -209,12 +209,14 @@ def _restore_thresholds(
     They are (accept, reject), for the bounds lower and upper of the success probability: a part was
     accepted if lower >= the first, rejected if 1 - upper >= the second; if both held, a
     `MemberRule` (a rule that learns) had it verified. Labels of quarantined traces (never used in
-    training), labels of rejected parts that somebody inspected, and checks that were not reported
-    in time do not update the rule. The rule of the guarantee "local" with stops="some" learns
-    nothing, so both thresholds are the policy's lower bound; but if the version stored the state of
-    another rule, the result is None. Of any other rule the result is None if `_restore_rule`
-    returns None, or if the rule is no `MemberRule`: only rules of this class have thresholds.
-    Raises what `_restore_rule` raises, and what a user's rule raises in an update.
+    training) and of rejected parts that somebody inspected do not update the rule, nor do checks
+    without a report, which an engine counts as wrong when they are overdue. The rule of the
+    guarantee "local" (a guarantee is what is promised about decisions) with stops="some" (not every
+    bad accepted part is reported) learns nothing, so both thresholds are the policy's lower bound;
+    but if the version stored the state of another rule, the result is None. Of any other rule the
+    result is None if `_restore_rule` returns None (the version stored no state that fits the rule,
+    or a user's rule is not imported), or if the rule is no `MemberRule`: only rules of this class
+    have thresholds. Raises what `_restore_rule` raises, and what a user's rule raises in an update.
     """
     has_state = bool(arrays_with_prefix(stored.state, "rule."))
     if (policy.guarantee, policy.stops) == ("local", "some") and not has_state:

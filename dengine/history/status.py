@@ -603,8 +603,9 @@ def read_watch(store: SqlStore, recipe: Recipe, began: Event | None) -> Watch | 
     or for many novel traces (`novelty`). Its alarm begins a safe mode, in which parts are checked
     until new outcomes allow decisions again. Both are read from the present decision rule, which
     `load_rule` returns. None if it returns None, and if the rule has no drift detectors: that of
-    the guarantee "local" with stops="some", and a user's rule that is no `MemberRule`. The three
-    values grow from 0 to 1, the alarm. In a safe mode that novel traces began, all three are 0.
+    the guarantee "local" with stops="some", and a user's rule that is no `MemberRule`, the base
+    class of the rules with drift detectors. The three values grow from 0 to 1, the alarm. In a safe
+    mode that novel traces began, all three are 0.
 
     The text `recovery` says how many parts since the alarm (10,001 are counted at most) count as
     evidence, for how many of these accepting (rejecting, after an alarm about rejected parts) would
@@ -704,9 +705,9 @@ def history(store: SqlStore, last: int | None = None, **where: Any) -> Iterator[
         Number of newest decisions of the selection; all of these are read by this call. None: all
         decisions of the selection, which are read in pages during the iteration.
     **where
-        The selection: action, reason, label, since, until, predicted (the action that the model
-        alone would have taken) or part, the fields of `HistoryFilter`. A decision must fit all that
-        are given.
+        The selection: action, reason (why it was decided so), label, since and until (seconds since
+        1970, `until` excluded), predicted (the action that the model alone would have taken) or
+        part (its number), the fields of `HistoryFilter`. A decision must fit all that are given.
 
     Returns
     -------

@@ -171,7 +171,8 @@ _COMPILED: dict[Any, Any] = {}
 def template_of(eager: Decider, warm_up_shape: tuple[int, ...]) -> Any:
     """Return the template of a decider: a compiled decider of the same structure (`structure_of`).
 
-    A decider is the module that decides on one trace. If the process keeps no template of this
+    A decider is the module that decides on one trace. Deciders have the same structure if their
+    classes, constants and shapes of tensors are the same. If the process keeps no template of this
     structure, `eager`, a decider in Python, is compiled, which takes tens of milliseconds. The new
     template then decides three times on a trace of shape `warm_up_shape` (C, T) whose samples rise
     from 0 to 1, so that later calls are fast. The process keeps it, and drops the oldest if there
@@ -452,18 +453,20 @@ class ModelPrediction(EngineModel):
     ) -> Self:
         """Train the reducer on traces (n, C, T), and replace the references by them; return self.
 
-        References are the labelled points with which a new trace is compared. y (n,) are labels, 1
-        good or 0 bad; `hashes` (n,) stand for the parts, and give the folds for cross-fitting;
-        `numbers` (n,), the labels' sequence numbers, are kept with the references, and by them the
-        reducer finds what `precompute` kept; `stop` may end the reducer's training early. Extreme
-        samples are clipped first. A reducer that can go on from its last training does so. If there
-        are more traces than the classifier's `capacity`, only the last become references.
+        The reducer maps traces to points; references are the labelled points with which a new trace
+        is compared. y (n,) are labels, 1 good or 0 bad; `hashes` (n,) stand for the parts, and give
+        the folds for cross-fitting; `numbers` (n,), the labels' sequence numbers, are kept with the
+        references, and by them the reducer finds what it computed in advance (`precompute`); `stop`
+        may end its training early, after a number of steps or at a deadline. Extreme samples are
+        clipped first. A reducer that can go on from its last training does so. If there are more
+        traces than the classifier's `capacity`, only the last become references.
 
         Replaced are `index` (the references), `scale` (the divisor of the points in each embedding
         space), `gate` (the novelty gate, which notices traces unlike these; disabled if `novelty`
-        is 0, or for too few traces, see `fit_novelty`), `examples` (up to 8 of the traces),
-        `trace_shape`, and in `report` the note on parts that seem to have come twice. The module
-        that decides is dropped and built anew when it is used; the decision rule stays as it is.
+        is 0, or if fewer than 20 traces differ in part and content, see `fit_novelty`), `examples`
+        (up to 8 of the traces), `trace_shape`, and in `report` the note on parts that seem to have
+        come twice. The module that decides is dropped and built anew when it is used; the decision
+        rule stays as it is.
 
         Raises what the reducer's `train` raises, such as SettingError if it cannot be trained on
         these traces, and SettingError if 20 traces or more are all of one part. If the reducer
@@ -738,8 +741,9 @@ class ModelPrediction(EngineModel):
         rule of the new model has learned nothing, and is not stale (no update of it failed); the
         module that decides is not built yet. This model does not change. But the two share reducer
         and references (labelled points): a reference that is added, relabelled or removed in one is
-        so in the other, and `train` of one trains the reducer of both; so train a `successor`
-        instead. Raises what `Policy.rule` raises, such as SettingError if the rule cannot be made.
+        so in the other, and `train` of one trains the reducer of both; so train a `successor`,
+        which has a copy of the reducer, instead. Raises what `Policy.rule` raises, such as
+        SettingError if the rule cannot be made.
         """
         model = copy.copy(self)
         model.classifier = clone(self.classifier).set_params(
@@ -870,15 +874,15 @@ class ModelPrediction(EngineModel):
     def defect(self) -> str:
         """Return why an engine must not use this trained model; "" if no test finds a reason.
 
-        The references (labelled points) must be finite, and the points to which the reducer maps
-        `examples`, some training traces, must not be NaN. A reducer that is restored from the state
-        of this one must map `examples` to the same points, twice in a row; each coordinate may
-        differ by 1e-5 times (1 + its absolute value). If this reducer gives no state, it is itself
-        asked twice in place of a restored reducer. The points, divided by the scale of their
-        embedding space, are kept for `check_answers`, unless a reference is not finite. If
-        restoring raises a StoreError, that is a defect; other errors are raised. Call this right
-        after a training: a restored model has no `examples`, and some reducers raise TraceError
-        then.
+        The references (labelled points) must be finite, and the reducer, which maps traces to
+        points, must map `examples`, some training traces, to no NaN. A reducer that is restored
+        from the state of this one must map `examples` to the same points, twice in a row; each
+        coordinate may differ by 1e-5 times (1 + its absolute value). If this reducer gives no
+        state, it is itself asked twice in place of a restored reducer. The points, divided by the
+        scale of their embedding space, are kept for `check_answers`, unless a reference is not
+        finite. If restoring raises a StoreError, that is a defect; other errors are raised. Call
+        this right after a training: a restored model has no `examples`, and some reducers raise
+        TraceError then.
         """
         if not np.isfinite(self.index.column("points")).all():
             return "the embedding of a reference is not finite"

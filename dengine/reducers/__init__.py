@@ -54,7 +54,8 @@ def reducer_class(name: str) -> type:
     Returns
     -------
     type
-        A `Reducer`, or for `module:Class` any class with `fit`, `transform` and `get_params`.
+        A `Reducer` (its objects map traces to points), or for `module:Class` any class with `fit`,
+        `transform` and `get_params`.
 
     Raises
     ------

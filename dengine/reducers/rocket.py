@@ -634,7 +634,8 @@ class RocketReducer(ProbabilityReducer):
         arrays of each `Tower` (a group of features with its classifier heads), and the tensors of
         `net_`, the module that embeds, whose names begin with "net.". The cache of features is not
         among them. The losses and the towers' arrays are not copies. Raises NotFittedError before
-        there are kernels, AttributeError before the first fit.
+        there are kernels, which the first `precompute` or fit draws, and AttributeError between
+        `precompute` and the first fit.
         """
         check_is_fitted(self, "net_")
         state = {

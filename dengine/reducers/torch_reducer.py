@@ -314,10 +314,11 @@ class TorchReducer(ProbabilityReducer):
         """Take up to `steps` steps on traces (n, C, T); return the points of the traces.
 
         `labels` (n,) are 1 or 0, `folds` (n,) the folds, 0 to K - 1: fixed groups of traces.
-        `fit_loop` trains copy k of the network on the rows outside fold k; its docstring says what
-        it changes. Then a copy of the networks with averaged weights and new statistics of batch
-        normalisation becomes `encoder_`, the module that embeds. `stop` (a limit on the number of
-        steps, a deadline, or both) may end the steps earlier.
+        `fit_loop` trains copy k of the network on the rows outside fold k; this changes the copies,
+        the averages of their weights, the optimiser's state, the counts of steps and `loss_`. Then
+        a copy of the networks with averaged weights and new statistics of batch normalisation
+        becomes `encoder_`, the module that embeds. `stop` (a limit on the number of steps, a
+        deadline, or both) may end the steps earlier.
 
         But if `stop` allows no step at all, and this and the last training have `numbers` (n,), the
         increasing numbers of the labels, `encoder_` stays: traces of the last training, found by

@@ -317,8 +317,8 @@ class UmapReducer(Reducer):
         n_traces but at least 60. Either of these numbers is then limited to 200, and to 400,000 /
         n_traces but at least 1; quotients are rounded down. `train` takes fewer if its `stop` ends
         it, and counts the first 200 from 0 again if more than half of its traces are new or it gets
-        no numbers. Before the first training or `precompute` AttributeError is raised, unless
-        `n_epochs` was given.
+        no numbers (of their labels, which identify them). Before the first training or `precompute`
+        (the search of neighbours in advance) AttributeError is raised, unless `n_epochs` was given.
         """
         if self.n_epochs is not None:
             return self.n_epochs
@@ -547,10 +547,10 @@ class UmapReducer(Reducer):
         """Restore what `get_state` returned, and return self.
 
         The constructor's parameters must be the same; they are not compared with the state. What
-        `precompute` found is dropped. Raises StoreError if the arrays of `Frames`, the module that
-        shortens traces, are missing or have other sizes than the shape of the traces in `state`
-        asks for, and KeyError if another array is missing; the reducer may be partly changed by
-        then.
+        `precompute` found in advance for the next training is dropped. Raises StoreError if the
+        arrays of `Frames`, the module that shortens traces, are missing or have other sizes than
+        the shape of the traces in `state` asks for, and KeyError if another array is missing; the
+        reducer may be partly changed by then.
         """
         channels, samples = self.restore_shape(state)
         n_frames, *counts = map(int, state["counts"])

@@ -412,8 +412,9 @@ class RobotCalls:
     async def _find(self, request: Any) -> Struct | None:
         """Return the decision that was made under the id `request`, as a dict (`_as_struct`).
 
-        None if the id has no decision, and also if the queue is full, the service is closing, or
-        the store cannot look the id up. Raises ReportError for an invalid id.
+        None if the id has no decision, and also if the queue for the engine's thread is full, the
+        service is closing, or the store cannot look the id up. Raises ReportError for an invalid
+        id.
         """
         try:
             stored = await self._service.find(as_id(request))

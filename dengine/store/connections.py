@@ -116,8 +116,9 @@ def make_engine(url: str | None) -> sa.Engine:
 def _with_sqlite_events(engine: sa.Engine) -> sa.Engine:
     """Have an SQLAlchemy engine set up its SQLite connections for a store; return the engine.
 
-    From then on it calls `_connect_sqlite` to connect, `_set_pragmas` for each new connection, and
-    `_begin_transaction` for each transaction.
+    From then on it calls `_connect_sqlite` to connect (a file that cannot be written is opened for
+    reading), `_set_pragmas` for each new connection (WAL mode; a commit survives a power failure),
+    and `_begin_transaction` for each transaction (one that writes takes the write lock at once).
     """
     sa.event.listen(engine, "do_connect", _connect_sqlite)
     sa.event.listen(engine, "connect", _set_pragmas)
@@ -402,10 +403,10 @@ class Database:
         and OSError, ValueError, TypeError and OverflowError, become StoreError; dengine's own
         errors and all others pass unchanged.
 
-        StoreError is raised, too, if the function given to `commit_if` returns False, and if the
-        SQLite file was replaced. If this is noticed only after the commit, the rows are in the file
-        that was replaced; and if the connection to a server broke during the commit, the server may
-        have the rows.
+        StoreError is raised, too, if the function given to `commit_if`, which says whether the
+        commit is still wanted, returns False, and if the SQLite file was replaced. If this is
+        noticed only after the commit, the rows are in the file that was replaced; and if the
+        connection to a server broke during the commit, the server may have the rows.
         """
         with _store_errors("write to", self.name), self._writer.connect() as connection:
             connection.execution_options(dengine_write=True)

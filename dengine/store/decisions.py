@@ -141,7 +141,7 @@ class DecisionTable(CellTable):
         return [read_decision(row) for row in (rows[::-1] if newest else rows)]
 
     def unreported_accepts(self, since_version: int = 0) -> list[str]:
-        """Return the ids of the cell's accepted decisions without a label, oldest first.
+        """Return the ids of the robot cell's accepted decisions without a label, oldest first.
 
         Parameters
         ----------

@@ -200,8 +200,9 @@ def _find_problem(label: NewLabel, row: Any, first: Any) -> str:
     `row` is the stored row of its decision, or None. `first` is the label that the decision has, or
     None; it is this row or a `NewLabel`. It is a problem if there is no row, or if its content hash
     or time is not that which the label names for its decision. A second label is a problem, unless
-    it repeats the first, or is a late stop (it says that an accepted part was bad, after it had
-    counted as good). A late stop is a problem if a person has withdrawn the first label.
+    it repeats success and source of the first, or is a late stop (it says that an accepted part was
+    bad, after it had counted as good). A late stop is a problem if a person has withdrawn the first
+    label.
     """
     if row is None:
         return f"{_describe(label)}, which the store does not hold"

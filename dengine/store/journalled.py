@@ -272,10 +272,10 @@ class JournalledStore(Outbox):
 
         A label that is not on disk yet is left out, unless `unsynced` is True. A label from memory
         comes without number and time. Raise StoreError if the database must be asked (the decision
-        is not in memory, and its id may be an old one), and it or the journal (the local file that
-        gets each record first) has a fault, or there is no answer within `limit` seconds. Also if
-        the stored trace is damaged or cannot be read. Raise it also for an id whose last decision
-        was not recorded, because the id could not be looked up.
+        is not in memory, and its id may be that of an older one), and it or the journal (the local
+        file that gets each record first) has a fault, or there is no answer within `limit` seconds.
+        Also if the stored trace is damaged or cannot be read. Raise it also for an id whose last
+        decision was not recorded, because the id could not be looked up.
         """
         with self._changed:
             if decision_id in self._unrecorded:

@@ -52,12 +52,13 @@ def check_peer_settings(
     """Check that two robot cells of a product would embed a trace in the same way.
 
     A product is robot cells that share labels and versions (trained models). The settings on which
-    the arrays of a version depend must be equal: `reducer`, `params`, `folds`, `window` and
-    `novelty` of the `Recipe` (all settings of an engine), the seed, the `TraceSpec` (what traces
-    look like), and the name and description of an object that a user passed as reducer or model.
-    The policy and the rest of the `Recipe`, like the radius and the time limit of a retrain, may
-    differ. Nothing is compared if one of the cells has no recipe yet. The `TraceSpec` is compared
-    only if both cells have one.
+    the arrays of a version depend must be equal: `reducer`, its `params`, `folds` (number of
+    embedding spaces), `window` (number of traces that are used) and `novelty` (factor of the limit
+    beyond which a trace is novel) of the `Recipe` (all settings of an engine), the seed, the
+    `TraceSpec` (what traces look like), and the name and description of an object that a user
+    passed as reducer or model. The policy and the rest of the `Recipe`, like the radius and the
+    time limit of a retrain, may differ. Nothing is compared if one of the cells has no recipe yet.
+    The `TraceSpec` is compared only if both cells have one.
 
     Parameters
     ----------

@@ -234,11 +234,11 @@ class Recorder:
         threads that wait for `changed` are woken. A journal of more than 8 MiB is cleared first, if
         the `Drainer` copies its last records to the database within BATCH_SECONDS (0.05 s). If the
         journal's file was deleted, moved or replaced, it is created again, which is logged and
-        recorded as an event: records that the database lacks are copied into it from the lost file,
-        which is still open, and a file that is at its path by now is written over. Raise StoreError
-        if the disk fails, if that file cannot be created or is locked by another engine, or if the
-        lost file cannot be read (the journal then still uses the lost file); the entries then stay
-        in `unwritten`.
+        recorded as an event (a row of the store's log): records that the database lacks are copied
+        into it from the lost file, which is still open, and a file that is at its path by now is
+        written over. Raise StoreError if the disk fails, if that file cannot be created or is
+        locked by another engine, or if the lost file cannot be read (the journal then still uses
+        the lost file); the entries then stay in `unwritten`.
         """
         if self._journal.end > LONG:  # a cell that never pauses would fill the disk
             with self.changed:

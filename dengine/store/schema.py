@@ -227,7 +227,7 @@ def _stored_columns(connection: sa.Connection, table: str) -> set[str]:
 
 
 def _add_columns(connection: sa.Connection) -> None:
-    """Add the columns that an earlier dengine did not have (ADDED) to the tables of its store.
+    """Add to a store's tables the columns that an earlier dengine did not have (those in `ADDED`).
 
     They are NULL in its rows. A table that has them, or is no table of a store, is not changed.
     """

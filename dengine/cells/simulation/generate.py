@@ -28,7 +28,8 @@ def simulate(
 ) -> list[SimulatedInsertion]:
     """Simulate the first n cycles of a robot cell in parallel processes; return their insertions.
 
-    In the scenario "nominal" insertion i depends on (seed, i) alone; in the others also on n.
+    An insertion is one part that is pressed into its place, with its trace and label. In the
+    scenario "nominal" insertion i depends on (seed, i) alone; in the others also on n.
 
     Parameters
     ----------

@@ -155,9 +155,10 @@ class RtdeRecorder(AbstractContextManager["RtdeRecorder"]):
     def record(self, timeout: float = 60.0) -> InsertionRecord:
         """Wait for the next insertion after the last one, or after a call of `arm`, and return it.
 
-        It begins when the trigger, a condition on the values that the controller sends, is met. It
-        may have begun before this call: the packages (the values sent at once) of the last 60 s are
-        buffered. What came earlier and was not read is lost, and `arm` discards what has come.
+        An insertion (the robot inserts one part) begins when the trigger, a condition on the values
+        that the controller sends, is met. It may have begun before this call: the packages (the
+        values sent at once) of the last 60 s are buffered. What came earlier and was not read is
+        lost, and `arm` discards what has come.
 
         An insertion that is not complete after `timeout` seconds, for example because the
         controller fell silent, is returned with NaN for the missing samples. If packages are

@@ -151,7 +151,7 @@ def choose_files(p: Proposal, root: Path) -> bool:
 
 
 def likely_endings(names: Names) -> Names:
-    """Return the endings of file names of which one may tell the recordings from other files.
+    """Return the endings of these file names of which one may tell recordings from other files.
 
     They are the suffixes that several files have, and `.mcap` even if only one file has it; if
     there are none of these, all suffixes. If there is only one, and the files are one for each part

@@ -183,8 +183,8 @@ def most_frequent(items: Sequence[tuple[Any, int]]) -> Any:
 def columns_of(tables: Tables, form: TextForm) -> dict[str, Column]:
     """Return the columns of the first table by their names, each with the tables that have it.
 
-    Columns that only other tables have are left out. `form` is the section `[text]` of the
-    description: how numbers are written.
+    Columns that only other tables have are left out. `form` says how numbers are written: it is the
+    section `[text]` of the description, a file that says how recordings are read.
     """
     return {
         name: Column(name, [table for table in tables if name in table.columns], form)

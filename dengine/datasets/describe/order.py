@@ -28,13 +28,15 @@ VERDICT_FOLDER = re.compile(rf"(?i)(?<![^/])({WORD})/")
 def propose_order(p: Proposal) -> None:
     """Set `order` in `p` to what is certain: `name`, `path` if labels stand first in names, or `?`.
 
-    It is `?`, with a note, if the files, folder by folder, have another order than their names, or
-    if the names do not count the parts (`counts_parts`). The text of `label.path` and folders named
-    like a verdict do not count; while `label.column` is `?`, names are not looked at. It is `?`,
-    too, if the part numbers, or the names of columns that are parts, fall or are sorted as texts
-    (P10 before P2), or if a date or time of each recording does not rise (`falling_stamps`). If
-    several of these hold, the note is on the last. An `order` that the user stated stays. Raises
-    SettingError for a malformed `windows.trigger`.
+    `p` is the description so far; `name` means by file name, and `path` folder by folder, without
+    the text that is the label. It is `?`, with a note, if the files, folder by folder, have another
+    order than their names, or if the names do not count the parts: they do not differ first in a
+    number or date (`counts_parts`). The text of `label.path` and folders named like a verdict do
+    not count; while `label.column` is `?`, names are not looked at. It is `?`, too, if the part
+    numbers, or the columns' names where each column is a part, fall or are sorted as texts (P10
+    before P2), or if a date or time of each recording does not rise (`falling_stamps`). If several
+    of these hold, the note is on the last. An `order` that the user stated stays. Raises
+    SettingError for a malformed `windows.trigger`, the condition at which long recordings are cut.
     """
     label = p.description.label
     # A folder of a verdict is no step of the production, even if the label stands elsewhere.
@@ -93,14 +95,16 @@ def counts_parts(names: Sequence[str]) -> bool:
 
 
 def falling_stamps(p: Proposal, tables: Sequence[Table]) -> Iterator[LabelSource]:
-    """Yield each place with a date or time for each recording, by which these do not rise.
+    """Yield each place with a date or time for each recording, by which these are out of order.
 
     The places are the file names, if they have dates with the year in front; columns without
     another use that have one word in all rows of a recording; lines above the header of the first
     table; and columns of listings of labels. A column or line counts if its words are dates or
     times of a known form (`Column.forms`), or if its name says so (`timestamp`, `created`); then
-    they are sorted as `natural_key` sorts texts. If several forms fit, one in which they rise is
-    enough. Raises SettingError for a malformed `windows.trigger`.
+    they are sorted as texts, numbers in them by their size (`natural_key`). Equal ones are in
+    order, and if several forms fit, one in which they are in order is enough. `p` is the
+    description so far. Raises SettingError for a malformed `windows.trigger`, the condition at
+    which a part begins.
 
     tables : the table of each recording, in the order to be compared.
     """

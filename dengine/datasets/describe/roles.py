@@ -148,14 +148,15 @@ def qualify_rows(p: Proposal) -> None:
 def qualifies(column: Column, n_rows: int) -> bool:
     """Return whether the words of a column may tell which rows are samples.
 
-    It must have a cell in each of the `n_rows` rows of all recordings, or one for each recording
-    that has it. It may have at most 12 different words; but their number does not matter if it is
-    named like a status (`Status`, `valid`) and has a text that is not in `LOST`. The words must
-    change within a recording, or there must be several words, of which one names a force or a
-    torque. A column that is named like a status may have numbers, and also just one word in all;
-    but if it is named like a verdict, too, and this word is known to mean good or bad, the result
-    is False, because the column holds labels. Any other column must have texts, or empty cells if
-    it is named like a verdict, and must not be named like a clock.
+    It must have a cell in each of the `n_rows` rows of all recordings, or a single one for each
+    recording that has the column. It may have at most 12 different words; but their number does not
+    matter if it is named like a status (`Status`, `valid`) and has a text other than those for lost
+    values (`LOST`, like `nan` or `-`). The words must change within a recording, or there must be
+    several words, of which one names a force or a torque. A column that is named like a status may
+    have numbers, and also just one word in all; but if it is named like a verdict (`result`), too,
+    and this word is known to mean good or bad, the result is False, because the column holds
+    labels. Any other column must have texts, or empty cells if it is named like a verdict, and must
+    not be named like a clock (`time`).
     """
     words = column.counts
     is_named = QUALIFIER_NAME.search(column.name) is not None
@@ -267,8 +268,8 @@ def _other_scales(p: Proposal) -> Iterator[str]:
 
     It is named like a unit, a factor or a rate, and its word is not the same in all recordings.
     Recordings in which it is missing, empty or changes are ignored. The columns are those without a
-    role, and the lines are those of the first table. Raises SettingError for a malformed
-    `windows.trigger`.
+    role (such as channel, clock or label), and the lines are those of the first table. Raises
+    SettingError for a malformed `windows.trigger`.
     """
     for source in sources_named(p, SCALE_NAME, SCALE_NAME):
         words = part_words(source, p.tables).values()
@@ -340,13 +341,14 @@ def find_lost(p: Proposal) -> None:
 def propose_lengths(p: Proposal) -> None:
     """Set `traces.samples` in `p`, if it is 0, to the median length of the recordings.
 
-    It is rounded down. The length is that of the first channel; without one nothing is set.
-    Recordings without rows are ignored; if all are, the length is 0. If some have another length
-    than this median, also where `traces.samples` is stated, and `traces.lengths` is not stated, a
-    note counts them, and `traces.lengths` becomes `pad` if they are more than 10 % of the
-    recordings, else `strict`. A stated `traces.samples` stays. Unless `traces.samples` is stated,
-    another note counts the recordings that end with two zeros or NaN or more, if they are more
-    than 10 %: these may fill up shorter recordings.
+    `p` is the description so far. The median is rounded down. The length is that of the first
+    channel; without one nothing is set. Recordings without rows are ignored; if all are, the length
+    is 0. If some have another length than this median, also where `traces.samples` is stated, and
+    `traces.lengths` is not stated, a note counts them, and `traces.lengths` becomes `pad` (their
+    end is cut, or their last sample repeated) if they are more than 10 % of the recordings, else
+    `strict` (they are left out). A stated `traces.samples` stays. Unless `traces.samples` is
+    stated, another note counts the recordings that end with two zeros or NaN or more, if they are
+    more than 10 %: these may fill up shorter recordings.
     """
     if p.description.channels:
         column = p.columns[next(iter(p.description.channels))]

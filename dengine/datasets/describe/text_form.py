@@ -76,8 +76,8 @@ def look(content: bytes, stated: Stated) -> Look:
     that Python does not know.
 
     stated : keys that the user gave. `text.encoding` and `text.delimiter` are taken, and so is
-    `text.header` if it is a text, with which the header begins; a number only says that a doubt
-    about the header is no error.
+    `text.header` if it is a text, with which the header begins, unless no line above the samples
+    begins with it. With any `text.header`, also a number, a doubt about the header is no error.
     """
     encoding, text = decode(content, stated.get("text.encoding", ""))
     lines = text.rstrip("\n").split("\n")
@@ -268,7 +268,7 @@ def _propose_keys(p: Proposal, looks: Sequence[Look]) -> None:
     samples, are counted from it. If any file is read as cp1252, the first such file counts instead,
     and a note says that the encoding is guessed. `_column_names` gives `text.names`, the names of
     the columns in place of a header; it is empty if the user stated a header other than 0.
-    `propose_marks` sets the marks in numbers. Stated keys stay.
+    `propose_marks` sets the decimal mark and the mark of thousands. Stated keys stay.
 
     looks : how each of the files, which are of one form, is written, and the cells of its samples.
     """

@@ -234,7 +234,7 @@ class LabelReader:
         """Return a sentence on rows of the listing that name no recording, "" if there is none.
 
         A listing is a file with a row for each recording or part. These are the rows whose key is
-        not in `used`, the keys that were looked up, also if their recording failed before its word
+        not in `used`, the keys that were looked up, also if their recording failed before its label
         was looked up. The sentence has up to eight keys, and counts keys: rows with the same key
         count once.
         """

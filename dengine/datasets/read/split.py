@@ -155,15 +155,15 @@ def _split_rows(table: Table, description: Description) -> Iterator[Table]:
 def _split_wide(table: Table, description: Description) -> Iterator[Table]:
     """Yield the table of each row, which is a part.
 
-    A channel like `x*` gets its samples from the columns in which a number stands for the `*`, in
-    the order of these numbers, without empty cells at the end; its unit is that of the first of
-    these columns, and they are in no part themselves. Any other cell becomes a column of one cell,
-    or, if it is a list or mapping, one column or several (`frames.columns_of`); a column without a
-    cell for each row is in every part as a whole, and an empty one in none. A part has `damage`
-    (errors for which it is left out) if its row had a wrong number of cells. If a list of lists or
-    mappings in it has items that are not all alike, that is its only damage, and it has no columns;
-    a list that begins with a number or text may be mixed. Raises UnreadableError if the columns of
-    a channel like `x*` differ in length.
+    A channel or clock like `x*` gets its samples from the columns in which a number stands for the
+    `*`, in the order of these numbers, without empty cells at the end; its unit is that of the
+    first of these columns, and they are in no part themselves. Any other cell becomes a column of
+    one cell, or, if it is a list or mapping, one column or several (`frames.columns_of`); a column
+    without a cell for each row is in every part as a whole, and an empty one in none. A part has
+    `damage` (errors for which it is left out) if its row had a wrong number of cells. If a list of
+    lists or mappings in it has items that are not all alike, that is its only damage, and it has no
+    columns; a list that begins with a number or text may be mixed. Raises UnreadableError if the
+    columns of one `x*` differ in length.
     """
     n = len(table.lines)
     origin: dict[str, list[str]] = {}
