@@ -60,6 +60,7 @@ PLACES = (  # of any words: folders, and the words of a file's name, counted fro
     "([^-_ /]+)(?:[-_ ][^-_ /]*){3}$",
     "(?:^|/)([^-_ /]+)[^/]*$",
 )
+LISTED = re.compile(r"\((?!\?)(?:[\w /|-]|\\\W)+\)")  # a group of words, with escaped marks
 OWN = ("npz", "y", (), {"0", "1"})  # labels as dengine's own archives have them
 NO_LABEL = "none was found that is certain: state label.column, path, line or listing"
 Names = Iterable[str]
@@ -78,7 +79,7 @@ def with_meanings(source: LabelSource, words: Names) -> LabelSource:
     the name is; yes, 1 and their opposites have no known meaning there.
     """
     words = sorted({*words})
-    name = source.column or source.line or source.topic or ("([^" in source.path and source.path)
+    name = source.column or source.line or source.topic or ("" if lists_words(source) else source.path)
     groups: Sequence[Sequence[str]] = (GOOD, BAD, UNCHECKED)
     if name and {word.lower() for word in words} <= {*YES, *NO, *UNCHECKED}:
         groups = (YES, NO, UNCHECKED) if GOOD_NAME.fullmatch(name) else ((), (), UNCHECKED)
@@ -89,6 +90,11 @@ def with_meanings(source: LabelSource, words: Names) -> LabelSource:
         bad=source.bad or bads or (UNKNOWN,),
         unchecked=source.unchecked or others,
     )
+
+
+def lists_words(source: LabelSource) -> bool:
+    """Return whether the group of `source.path` lists its words, like `(ok|nok)`, not `([^/]+)`."""
+    return LISTED.search(source.path) is not None
 
 
 def has_meaning(source: LabelSource, words: Names) -> bool:
@@ -122,7 +128,8 @@ def is_named_like_verdict(source: LabelSource) -> bool:
     line and path counts.
     """
     name = source.column or source.line
-    return "([^" not in source.path and (not name or NAME.fullmatch(name) is not None)
+    is_named = not name or NAME.fullmatch(name) is not None
+    return is_named and (not source.path or lists_words(source))
 
 
 def may_be_labels(source: LabelSource, words: Names) -> bool:

@@ -5,6 +5,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from itertools import zip_longest
+from typing import Any
 
 import numpy as np
 
@@ -120,7 +121,10 @@ def falling_stamps(p: Proposal, tables: Sequence[Table]) -> Iterator[LabelSource
         words = [*words_of(p, source, tables, parts).values()]
         cells = Table("", {"": np.array(words, dtype=object)}, [])
         forms = Column("", [cells], TextForm()).forms if words else []
-        ranks = [times_of(cells, Clock(("",), (form,)), TextForm()).tolist() for form in forms]
+        ranks: list[Any] = []
+        for form in forms:
+            with suppress(DataError):  # a word far behind may be no time
+                ranks.append(times_of(cells, Clock(("",), (form,)), TextForm()).tolist())
         if source.path or STAMP_NAME.search(source.column or source.line):
             ranks = ranks or [[*map(natural_key, words)]]
         if ranks and not any(rank == sorted(rank) for rank in ranks):

@@ -276,11 +276,11 @@ def _propose_keys(p: Proposal, looks: Sequence[Look]) -> None:
     form = usual.form
     above = int(form.header)
     is_moved = {item.form.header for item in looks} != {above}
-    if above and (is_moved or isinstance(p.description.text.header, str)):
+    if above and isinstance(p.stated.get("text.header", "" if is_moved else 0), str):
         units = form.units and form.units - above
         form = replace(form, header=usual.line, units=units, data=form.data - above)
     if form.encoding == LATIN:
-        p.notes["text.encoding"] = f"{LATIN} reads any text: look at the letters below"
+        p.put("text.encoding", LATIN, f"{LATIN} reads any text: look at the letters below")
     names = () if p.stated.get("text.header") else tuple(_column_names(usual))
     for key, value in asdict(replace(form, names=names)).items():
         p.put(f"text.{key}", value)
