@@ -82,13 +82,13 @@ def as_options(text: str) -> str:
 
     def to_option(match: re.Match[str]) -> str:
         """Return an option as typed, `--rate-hz 500`, of a match of `OPTION`; data as they are."""
-        if not (match[1] or match[3]):
+        name = match[1] or match[3]
+        if not name:
             return match[0]
-        name = (match[1] or match[3]).replace("_", "-")
         value = match[2] or ""
         if value[:1] in QUOTES:
             value = shlex.quote(value[1:-1])
-        return f"--{name} {value}".rstrip()
+        return f"--{name.replace('_', '-')} {value}".rstrip()
 
     return OPTION.sub(to_option, TRACE_SPEC.sub(r"\1", text))
 
@@ -115,6 +115,11 @@ def outward(lower: float, upper: float, digits: int) -> tuple[float, float]:
 def counted(n: int, noun: str) -> str:
     """Return a number with its noun, of which the plural ends in s: "1 part", "1,200 parts"."""
     return f"{n:,} {noun}{'' if n == 1 else 's'}"
+
+
+def capitalized(text: str) -> str:
+    """Return the text with its first letter in upper case."""
+    return text[0].upper() + text[1:]
 
 
 def amount(value: float) -> str:

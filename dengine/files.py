@@ -78,7 +78,8 @@ def check_size(size: float, source: object) -> None:
     limit = MAX_BYTES
     with suppress(AttributeError, ValueError, OSError):  # on systems without these figures
         memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-        limit = min(MAX_BYTES, memory // 2) if memory > 0 else MAX_BYTES
+        if memory > 0:
+            limit = min(limit, memory // 2)
     if size > limit:
         raise DataError(
             f"Expected at most {limit / 2**20:,.0f} MB of arrays in {source}, got "

@@ -24,7 +24,7 @@ import numpy as np
 from .decision.policy import OLD_NAME, Policy, check_radius
 from .errors import SettingError, StoreError, expect, instead, listed
 from .files import toml_value
-from .records import is_number, is_whole
+from .records import StoredSettings, is_number, is_whole
 from .reducers import REDUCERS, class_default, make_reducer, reducer_class
 
 Params = Mapping[str, bool | int | float | str]
@@ -279,9 +279,7 @@ class Recipe:
             raise SettingError(f"{where}: {str(error).rstrip('.')}.") from error
 
     @classmethod
-    def from_store(
-        cls, settings: Mapping[str, str], where: str = "the recipe in the store"
-    ) -> Recipe:
+    def from_store(cls, settings: StoredSettings, where: str = "the recipe in the store") -> Recipe:
         """Parse the recipe in the settings of a store, ``settings["recipe"]``, and return it.
 
         A recipe holds every setting of an engine. `settings` has texts by name. No class of a
@@ -410,7 +408,7 @@ def _name_and_params(reducer: Any, params: Params) -> tuple[str, Params]:
     if isinstance(reducer, str):
         return reducer, params
     cls = type(reducer)
-    values: dict[str, Any] = reducer.get_params(deep=False)
+    values: Table = reducer.get_params(deep=False)
     defaults = {name: parameter.default for name, parameter in signature(cls).parameters.items()}
     is_plain = all(
         (isinstance(value, PLAIN) and value != "none")

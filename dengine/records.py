@@ -24,6 +24,8 @@ Ints = NDArray[np.int64]
 TraceArray = NDArray[np.float32]  # the samples of a trace, (channels, samples), or of n of them
 State = dict[str, NDArray[Any]]  # arrays of a version of the model, by name
 Arrays = Mapping[str, NDArray[Any]]  # the same, only read
+StoredSettings = Mapping[str, str]  # of an engine, as texts by name
+Embedding = tuple[tuple[float, ...], ...]  # (K, d): a point in each space
 
 
 def is_whole(value: Any, least: int, most: int) -> bool:
@@ -31,9 +33,8 @@ def is_whole(value: Any, least: int, most: int) -> bool:
 
     Both ends are included. True, False and floats such as 1.0 are no integers here.
     """
-    if not isinstance(value, Integral) or isinstance(value, bool):
-        return False
-    return least <= int(value) <= most
+    is_integer = isinstance(value, Integral) and not isinstance(value, bool)
+    return is_integer and least <= int(value) <= most
 
 
 def is_number(value: Any) -> bool:
@@ -229,7 +230,7 @@ class TraceSpec:
         )
 
 
-def stored_trace_spec(settings: Mapping[str, str]) -> TraceSpec | None:
+def stored_trace_spec(settings: StoredSettings) -> TraceSpec | None:
     """Parse the `TraceSpec` among the settings of a store, which are texts by name.
 
     A `TraceSpec` says what traces look like: shape, sampling rate, units. Returns None if there is
@@ -289,7 +290,7 @@ class Decision:
     upper: float
     n_success: int
     n_failure: int
-    embedding: tuple[tuple[float, ...], ...] | None
+    embedding: Embedding | None
     model_version: int
     reason: Reason
     audit: bool
@@ -397,7 +398,7 @@ def as_success(value: Any, owner: str = "") -> bool:
         For any other value.
     """
     plain = value[()] if isinstance(value, np.ndarray) and value.ndim == 0 else value
-    if isinstance(plain, bool | np.bool_ | Real) and (plain == 0 or plain == 1):
+    if isinstance(plain, np.bool_ | Real) and (plain == 0 or plain == 1):
         return bool(plain)
     whose = f" of {owner}," if owner else ""
     raise ReportError(
@@ -407,16 +408,15 @@ def as_success(value: Any, owner: str = "") -> bool:
     )
 
 
-def as_outcome(value: Any, owner: str = "") -> Outcome:
+def as_outcome(value: Any, owner: str) -> Outcome:
     """Convert an `Outcome`, or its text such as "stopped", to an `Outcome`, and return it.
 
     Raises ReportError for any other value, also for True and None. Its message says whose value it
-    is if `owner` is given, like "decision 1a2b".
+    is, the `owner`'s, like "decision 1a2b".
     """
-    whose = f" of {owner}," if owner else ""
     with instead(
         ReportError,
-        f"Expected an Outcome, {', '.join(Outcome)},{whose} got {shortened(value)}",
+        f"Expected an Outcome, {', '.join(Outcome)}, of {owner}, got {shortened(value)}",
         ValueError,
         TypeError,
         do="return Outcome.UNKNOWN where nothing is known",

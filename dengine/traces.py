@@ -55,13 +55,14 @@ def as_trace(trace: Any, trace_spec: TraceSpec | None) -> TraceArray:
         `TraceGate` finds them.
     """
     x = _with_channels(trace, 2, "one trace, (samples,) or (channels, samples)")
+    channels, samples = x.shape
     if trace_spec is not None:
         x = _match_spec(x, trace_spec)
-    elif len(x) > x.shape[1]:
+    elif channels > samples:
         raise TraceError(
-            f"Expected (channels, samples), got {len(x)} channels of {x.shape[1]} samples, which "
-            f"looks transposed; turn it, trace.T, or agree on TraceSpec(samples={x.shape[1]}, "
-            f"channels={len(x)}) first if it is meant."
+            f"Expected (channels, samples), got {channels} channels of {samples} samples, which "
+            f"looks transposed; turn it, trace.T, or agree on TraceSpec(samples={samples}, "
+            f"channels={channels}) first if it is meant."
         )
     x = np.ascontiguousarray(x)
     return x if x.flags.writeable else x.copy()  # torch warns of read-only, memory-mapped arrays
@@ -268,7 +269,7 @@ class TraceGate(nn.Module):
 
     def __init__(self, size: int) -> None:
         super().__init__()
-        self.clamp = float(CLAMP)
+        self.clamp = CLAMP
         self.not_finite = NOT_FINITE
         self.constant = CONSTANT
         self.saturated = SATURATED
@@ -429,13 +430,12 @@ def infer_trace_spec(x: TraceArray) -> tuple[TraceSpec, bool]:
     TraceError
         For a trace of fewer than 10 samples per channel.
     """
-    trace_spec = TraceSpec(samples=x.shape[1], channels=x.shape[0])
-    if trace_spec.samples < MIN_SAMPLES:
+    channels, samples = x.shape
+    if samples < MIN_SAMPLES:
         raise TraceError(
             f"Expected a first trace of {MIN_SAMPLES} samples or more, for it sets the TraceSpec "
-            f"of all that follow, got {trace_spec.channels} x {trace_spec.samples}; record longer, "
-            f"or start with DataEngine(trace=TraceSpec(samples={trace_spec.samples}, "
-            f"channels={trace_spec.channels})) if it is meant."
+            f"of all that follow, got {channels} x {samples}; record longer, or start with "
+            f"DataEngine(trace=TraceSpec(samples={samples}, channels={channels})) if it is meant."
         )
     reason, _ = TraceGate(x.size)(torch.from_numpy(x))
-    return trace_spec, reason == 0
+    return TraceSpec(samples, channels=channels), reason == 0

@@ -10,13 +10,13 @@ happens either all at once or in short steps between cycles.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 from ..decision.scripting import reason_of
 from ..errors import log
 from ..model.base import EngineModel
 from ..records import RetrainReport
+from ..store.records import Clock
 from .guard import NO_REFERENCE, guarded
 from .trainer import Trained, TrainedOn, TrainingWindow
 
@@ -53,7 +53,7 @@ class Candidate:
         previous: EngineModel,
         version: int,
         corrected_to: int,
-        clock: Callable[[], float],
+        clock: Clock,
     ) -> None:
         self.model = trained.model
         self.report = RetrainReport(

@@ -15,7 +15,7 @@ from typing import Any
 from ..decision.intervals import SORTING_GUARANTEES
 from ..decision.members import SAFE_MODES
 from ..decision.policy import Policy
-from ..errors import ReportError, expect, listed
+from ..errors import ReportError, capitalized, expect, listed
 from ..records import as_success, is_whole
 from ..store.outbox import Outbox
 from ..store.records import (
@@ -233,7 +233,7 @@ class Corrections:
         ):
             text += f"; version {live.version}, which learned from this, is pinned no more"
             self._learner.release(author)
-        return self._change_labels(Change("forget", text, data, author, tuple(labels), None))
+        return self._change_labels(Change("forget", text, data, author, tuple(labels)))
 
     def release(self, author: str = "") -> Changed:
         """Let retrains replace again the version that `rollback` pinned (kept in force).
@@ -406,7 +406,8 @@ class Corrections:
         )
         present = self._settings.now
         check_rate(policy.force_limits, present.trace)
-        old_values = present.recipe.policy.to_values()
+        old_policy = present.recipe.policy
+        old_values = old_policy.to_values()
         new_values = policy.to_values()
         changes = {name: value for name, value in new_values.items() if value != old_values[name]}
         if not changes:
@@ -417,9 +418,10 @@ class Corrections:
         self._bring_up_to_date()
         # An audit counts by its inclusion probability, so the pooled evidence must be of one audit
         # rate.
-        is_sorting = policy.guarantee in SORTING_GUARANTEES
-        old_probability = present.recipe.policy.inclusion_probability
-        rate_counts = is_sorting and policy.inclusion_probability != old_probability
+        rate_counts = (
+            policy.guarantee in SORTING_GUARANTEES
+            and policy.inclusion_probability != old_policy.inclusion_probability
+        )
         starts_anew = not is_baseline and (rate_counts or any(name in changes for name in SCORING))
         live = self._live
         since = live.next_version
@@ -521,16 +523,11 @@ class Corrections:
         if number is None:
             number = self._store.events.newest(1)[0].number
         self._feedback.announce_safe_mode(reason_ended)
-        return Changed(change.kind, _sentence(f"{change.text}."), number, self._live.version)
+        return Changed(change.kind, capitalized(f"{change.text}."), number, self._live.version)
 
     def _as_unchanged(self, kind: str, text: str) -> Changed:
         """Return a `Changed` for a request that was fulfilled already; no event is recorded."""
-        return Changed(kind, _sentence(f"{text}; nothing changed."), None, self._live.version)
-
-
-def _sentence(text: str) -> str:
-    """Return the text with its first letter in upper case."""
-    return text[0].upper() + text[1:]
+        return Changed(kind, capitalized(f"{text}; nothing changed."), None, self._live.version)
 
 
 def _labels_are(ids: Sequence[str]) -> str:

@@ -319,8 +319,7 @@ def _verify(x: TraceArray, conditions: DecisionConditions, reason: Reason) -> Ve
     """Decide without a model: VERIFY for `reason`, unless a fault or a force limit decides; such a
     limit may also reject.
     """
-    verdict: Verdict = decider_without_model(conditions, reason)(torch.from_numpy(x))
-    return verdict
+    return decider_without_model(conditions, reason).forward(torch.from_numpy(x))
 
 
 def check_same_trace(stored: StoredDecision, trace: Any, spec: TraceSpec | None) -> Decision:

@@ -16,7 +16,7 @@ from __future__ import annotations
 import os
 import time
 import weakref
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Iterator
 from concurrent.futures import Executor
 from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import replace
@@ -51,18 +51,19 @@ from ..reducers.base import Reducer
 from ..store.journalled import CLOSE_SECONDS
 from ..store.opening import LONG_WAIT, open_outbox, opening
 from ..store.outbox import Outbox
-from ..store.records import StoredDecision, unknown_decision
+from ..store.records import Clock, StoredDecision, unknown_decision
 from ..traces import check_rate
 from .corrections import Changed, Corrections
 from .decide import DecisionMaker, as_part
 from .exclusive import ExclusiveUse
-from .feedback import Feedback, Remedy
+from .feedback import Feedback, Remedy, SafeModeListener
 from .fleet import Peers
 from .garbage import frozen_objects, uncollected
 from .guard import NOT_PRECOMPUTED, guarded
 from .learner import Learner
 from .live_model import LiveModel
 from .settings import (
+    AllowedImports,
     EngineSettings,
     Settings,
     SettingsInForce,
@@ -74,7 +75,7 @@ from .settings import (
     read_peers_trace_spec,
 )
 from .state import EngineState
-from .trainer import Clock, Retrainer, TrainingWindow
+from .trainer import Retrainer, TrainingWindow
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -89,7 +90,7 @@ class RunOptions(TypedDict, total=False):
     executor: Executor | None
     replaying: bool
     clock: Clock
-    on_safe_mode: Callable[[str], object] | None
+    on_safe_mode: SafeModeListener
 
 
 def _close_forgotten(outbox: Outbox) -> None:
@@ -211,7 +212,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         executor: Executor | None = None,
         replaying: bool = False,
         clock: Clock = time.perf_counter,
-        on_safe_mode: Callable[[str], object] | None = None,
+        on_safe_mode: SafeModeListener = None,
         reading: bool = False,
     ) -> None:
         """Make the objects of which the engine consists, on an opened store, and connect them.
@@ -324,7 +325,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         model: Model | None = None,
         trace: TraceSpec | None = None,
         wait: float | None = None,
-        allow_import: bool | Collection[str] = False,
+        allow_import: AllowedImports = False,
         reading: bool = False,
         **options: Unpack[RunOptions],
     ) -> Self:
@@ -1060,8 +1061,9 @@ def _new_settings(
         if recipe is None:
             # The schedule of conv is its own.
             recipe = Recipe(retrain_every=Reducer.default_retrain_every)
-    chosen = EngineSettings(choose_recipe(reducer, recipe, given), seed, trace=trace)
-    settings, template = chosen.with_template(model)
+    settings, template = EngineSettings(
+        choose_recipe(reducer, recipe, given), seed, trace=trace
+    ).with_template(model)
     n_traces = template.min_traces
     expect(
         settings.recipe.window >= n_traces,

@@ -27,6 +27,9 @@ from .live_model import LiveModel
 from .settings import SettingsInForce
 from .trainer import TrainingWindow
 
+# Called with the reason when a safe mode begins, and with "" when it ends.
+SafeModeListener = Callable[[str], object] | None
+
 
 class Remedy(Enum):
     """What must be done, once the store has every label, after a wrong label was learned."""
@@ -50,7 +53,7 @@ class Feedback:
     settings : SettingsInForce
         Whether an accepted part without a report is confirmed by the next decision, and since which
         version.
-    on_safe_mode : callable, optional
+    on_safe_mode : callable or None
         Called with the reason when a safe mode begins and with "" when it ends, after that was
         recorded.
 
@@ -71,7 +74,7 @@ class Feedback:
         live: LiveModel,
         window: TrainingWindow,
         settings: SettingsInForce,
-        on_safe_mode: Callable[[str], object] | None = None,
+        on_safe_mode: SafeModeListener,
     ) -> None:
         self._outbox = outbox
         self._live = live

@@ -14,10 +14,11 @@ import numpy as np
 
 from ..errors import StoreError, VersionError, log
 from ..store.outbox import Outbox
+from ..store.records import Clock
 from .guard import NOT_READY, guarded
 from .live_model import LiveModel
 from .resume import ChangedTracesError, add_labels_since, restore_model
-from .trainer import Clock, TrainedOn, TrainingWindow
+from .trainer import TrainedOn, TrainingWindow
 
 LOOK_SECONDS = 1.0  # between two looks for a newer version
 
@@ -66,8 +67,7 @@ class Peers:
         version, correction = self._outbox.call_store(
             lambda: (store.versions.newest_number(), store.corrections.newest_number())
         )
-        is_newer = version > max(self._live.version, self._refused)
-        return version if is_newer else 0, correction
+        return version if version > max(self._live.version, self._refused) else 0, correction
 
     def note_answer(self, error: StoreError | None) -> None:
         """Log that the store gave no answer, or that it answers again.

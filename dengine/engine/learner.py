@@ -23,7 +23,7 @@ from ..errors import StoreError, log
 from ..model.base import EngineModel
 from ..records import RetrainReport
 from ..store.outbox import Outbox
-from ..store.records import Change
+from ..store.records import Change, Clock
 from .candidate import Candidate
 from .feedback import Feedback, Remedy
 from .fleet import Peers
@@ -31,7 +31,7 @@ from .guard import NOT_PRECOMPUTED, NOT_READY, guarded
 from .live_model import LiveModel
 from .resume import add_labels_since, find_clean_start, restore_model
 from .settings import EvidenceWindow
-from .trainer import Clock, Retrainer, Trained, TrainedOn, TrainingWindow
+from .trainer import Retrainer, Trained, TrainedOn, TrainingWindow
 
 # So many labels without any retrain were imported, and the first training is worth preparing.
 IMPORTED = 500
@@ -355,7 +355,7 @@ class Learner:
         0, the call first takes in what the other cells stored: a change of a label or a rollback
         discards the training, and if the store is unavailable, the training waits for a later call.
         """
-        if self._candidate is None and self._retrainer.future is None:
+        if not self.is_at_work:
             return
         if self._peers is not None:
             to_the_end = True  # no version or correction of a peer comes in between two steps
@@ -517,11 +517,10 @@ class Learner:
         a store in memory the future is done.
         """
         report = candidate.complete_report(self.live.next_version)
-        newest_seq = self._window.newest_seq
         state = None
         if candidate.model is not None:
             state = self.live.get_state(candidate.model, candidate.trained_on)
-        return self._outbox.store_version(report, newest_seq, state)
+        return self._outbox.store_version(report, self._window.newest_seq, state)
 
     def _swap(self, candidate: Candidate) -> None:
         """Put a stored candidate (trained version) in force; keep its report for `take_report`.

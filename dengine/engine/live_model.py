@@ -28,8 +28,6 @@ from .resume import ChangedTracesError, add_labels_since, apply_correction, rest
 from .settings import EvidenceWindow
 from .trainer import TrainedOn, TrainingWindow
 
-Point = NDArray[np.float32]
-
 
 class LiveModel:
     """The model in force, with its decision rule and its references.
@@ -207,7 +205,7 @@ class LiveModel:
 
     def learn(
         self, stored: StoredDecision, success: bool, number: int, n_unreported: int | None
-    ) -> Point | None:
+    ) -> NDArray[np.float32] | None:
         """Update the rule with an outcome, and make the trace a reference of the model in force.
 
         The decision rule turns the bounds of a success probability into an action. A reference is
@@ -415,7 +413,6 @@ class LiveModel:
         state["corrected_to"] = np.array(self.corrected_to)
         state["overdue_to"] = np.array(self.overdue_to)
         if self.overdue:
-            state["includes_overdue"] = np.array(
-                True
-            )  # an engine that opens the store rebuilds the rule
+            # An engine that opens the store rebuilds the rule.
+            state["includes_overdue"] = np.array(True)
         return state

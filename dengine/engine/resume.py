@@ -57,9 +57,10 @@ def restore_model(
         return model.set_state(state)
     store = outbox.store
     first = int(trained_on.seq[0])
-    last = int(trained_on.seq[-1])
     outbox.check_integrity(first - 1)  # only the newest labels were checked before
-    data = store.labels.with_traces(first=first, last=last, corrected_to=trained_on.corrected_to)
+    data = store.labels.with_traces(
+        first=first, last=int(trained_on.seq[-1]), corrected_to=trained_on.corrected_to
+    )
     kept = np.isin(data.seq, trained_on.seq)
     corrected = {
         correction.seq: correction.success

@@ -16,7 +16,7 @@ from ..errors import ImportRefusedError, SettingError, StoreError, expect, liste
 from ..model.base import BaselineAdapter, EngineModel, Model
 from ..model.neighbours import ModelPrediction
 from ..recipe import OBJECT_PREFIX, Recipe, describe_estimator
-from ..records import TraceSpec, is_whole, stored_trace_spec
+from ..records import StoredSettings, TraceSpec, is_whole, stored_trace_spec
 from ..store.outbox import Outbox
 from ..traces import ForceLimitsGate
 
@@ -38,6 +38,8 @@ LOOP_SETTINGS = (
     *BASELINE_SETTINGS,
 )
 Settings = Mapping[str, Any]  # by name, as `DataEngine` takes them
+# Whether the classes that a store names may be imported, or which of them.
+AllowedImports = bool | Collection[str]
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,8 +99,12 @@ class EngineSettings:
             f"a seed of 0 or more, an integer of at most {MAX_SEED}",
             self.seed,
         )
-        is_spec = self.trace is None or isinstance(self.trace, TraceSpec)
-        expect(is_spec, "a TraceSpec as trace", self.trace, "TraceSpec(samples=1000) for one")
+        expect(
+            self.trace is None or isinstance(self.trace, TraceSpec),
+            "a TraceSpec as trace",
+            self.trace,
+            "TraceSpec(samples=1000) for one",
+        )
         if self.trace is not None:
             # It raises before the policy is in force.
             ForceLimitsGate(self.recipe.policy.force_limits, self.trace)
@@ -126,11 +132,11 @@ class EngineSettings:
     @classmethod
     def from_store(
         cls,
-        texts: Mapping[str, str],
+        texts: StoredSettings,
         name: str,
         reducer: Any = None,
         model: Model | None = None,
-        allow_import: bool | Collection[str] = False,
+        allow_import: AllowedImports = False,
     ) -> Self:
         """Return the settings of an engine from the texts that its store keeps.
 
@@ -180,9 +186,8 @@ class EngineSettings:
         numbers: list[int] = []
         for setting in ("seed", "policy_since", "evidence_since", "began_in"):
             text = texts.get(setting, "0")
-            is_valid = text.isdecimal() and text.isascii() and len(text) < 100
             expect(
-                is_valid,
+                text.isdecimal() and text.isascii() and len(text) < 100,
                 f"a {setting} in the store's settings",
                 text,
                 "restore the store from a copy",
@@ -244,7 +249,7 @@ class EngineSettings:
         policy = given.pop("policy", None)
         present = flat_settings(self.recipe)
         present |= {"seed": self.seed, "trace": self.trace or given.get("trace")}
-        unknown = sorted(set(given) - set(present))
+        unknown = sorted(given.keys() - present)
         if unknown:
             raise SettingError(
                 f"Expected settings of a DataEngine, got {', '.join(unknown)}, which it has not."
@@ -277,7 +282,7 @@ class EngineSettings:
 
 
 def _with_objects(
-    recipe: Recipe, texts: Mapping[str, str], name: str, reducer: Any, model: Model | None
+    recipe: Recipe, texts: StoredSettings, name: str, reducer: Any, model: Model | None
 ) -> Recipe:
     """Return a stored recipe, with the reducer object put into it if the recipe cannot name it.
 
@@ -327,7 +332,7 @@ def _with_objects(
     return recipe
 
 
-def _check_description(texts: Mapping[str, str], name: str, description: str) -> None:
+def _check_description(texts: StoredSettings, name: str, description: str) -> None:
     """Raise SettingError if an object that the user hands in again differs from the one before.
 
     `description` is a text with the object's class and, if it is a reducer, its parameters. It is
@@ -379,7 +384,7 @@ def named_classes(
     return [name for named in recipes for name in named.user_classes]
 
 
-def check_imports(recipe: Recipe, store: str, allow_import: bool | Collection[str]) -> None:
+def check_imports(recipe: Recipe, store: str, allow_import: AllowedImports) -> None:
     """Raise ImportRefusedError if a stored recipe names a class that may not be imported.
 
     A recipe has the settings of an engine. Whoever writes to the store could otherwise run code
@@ -420,7 +425,7 @@ def agreed_trace_spec(store: "SqlStore", stated: TraceSpec | None) -> TraceSpec 
 
 
 def fill_from_peers(
-    request: Settings, store: "SqlStore", allow_import: bool | Collection[str]
+    request: Settings, store: "SqlStore", allow_import: AllowedImports
 ) -> dict[str, Any]:
     """Return a copy of a new engine's settings, in which a peer's replace some that were not given.
 

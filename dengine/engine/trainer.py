@@ -8,7 +8,6 @@ training or of the executor stops the cell.
 
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
 from concurrent.futures import BrokenExecutor, Executor, Future
 from dataclasses import dataclass, field, replace
 from typing import Any, Protocol, Self, runtime_checkable
@@ -19,10 +18,10 @@ from numpy.typing import NDArray
 
 from ..decision.scripting import reason_of
 from ..errors import DengineError, SettingError, counted, log
-from ..model.base import EngineModel
-from ..records import TRAINED, Ints, TraceArray
+from ..model.base import NO_TRACES, EngineModel
+from ..records import TRAINED, Arrays, Ints, State, TraceArray
 from ..reducers.base import StopRule
-from ..store.records import LabelledTraces
+from ..store.records import Clock, LabelledTraces
 from .guard import NOT_PRECOMPUTED, guarded
 
 HUNG = 60.0  # seconds after which a training in the executor is given up
@@ -32,8 +31,6 @@ STEPS = 0.7
 FEWEST_STEPS = 0.3
 N_REMEMBERED = 20  # trainings; the next one reserves what the slowest of them took after its steps
 LATE = "ended by the clock, before its last step"
-
-Clock = Callable[[], float]
 
 
 class TrainingWindow:
@@ -53,12 +50,24 @@ class TrainingWindow:
 
     def __init__(self, capacity: int) -> None:
         self.capacity = capacity
-        self._block: list[NDArray[Any]] = []  # sequence numbers, traces, labels, hashes
-        self._first = 0  # the window is the rows from here of the block
-        self._end = 0
         nothing = np.zeros(0, np.int64)
-        no_traces = np.zeros((0, 1, 1), np.float32)
-        self.refill(LabelledTraces(nothing, no_traces, nothing.astype(np.int8), nothing))
+        self.refill(LabelledTraces(nothing, NO_TRACES, np.zeros(0, np.int8), nothing))
+
+    def refill(self, labelled: LabelledTraces) -> None:
+        """Replace the whole window by the newest of these labelled traces.
+
+        They must be ordered by the numbers of their labels. Their arrays become those of the window
+        and are not copied. Without any the window is empty.
+        """
+        self._block: list[NDArray[Any]] = [
+            labelled.seq,
+            labelled.traces,
+            labelled.labels,
+            labelled.hashes,
+        ]
+        # The window is the rows of the block from the first to the end.
+        self._end = len(labelled.seq)
+        self._first = max(0, self._end - self.capacity)
 
     def __len__(self) -> int:
         return self._end - self._first
@@ -96,16 +105,6 @@ class TrainingWindow:
             self._block[i] = np.concatenate([column[self._first :].reshape(n, *shape), room])
         self._first = 0
         self._end = n
-
-    def refill(self, labelled: LabelledTraces) -> None:
-        """Replace the whole window by the newest of these labelled traces.
-
-        They must be ordered by the numbers of their labels. Their arrays become those of the window
-        and are not copied. Without any the window is empty.
-        """
-        self._block = [labelled.seq, labelled.traces, labelled.labels, labelled.hashes]
-        self._end = len(labelled.seq)
-        self._first = max(0, self._end - self.capacity)
 
     def snapshot(self) -> LabelledTraces:
         """Return the labelled traces of the window, oldest first.
@@ -167,7 +166,7 @@ class TrainedOn:
         """
         return bool(len(self.seq)) and (seq < self.seq[0] or seq in self.seq)
 
-    def to_state(self) -> dict[str, NDArray[Any]]:
+    def to_state(self) -> State:
         """Return the four attributes as arrays by name, for the store; `from_state` reads them.
 
         Their names are "trained_on" (`seq`, the numbers of the labels), "trained_as"
@@ -183,7 +182,7 @@ class TrainedOn:
         }
 
     @classmethod
-    def from_state(cls, state: Mapping[str, NDArray[Any]]) -> Self:
+    def from_state(cls, state: Arrays) -> Self:
         """Return the record that `to_state` turned into arrays.
 
         Without "pinned" this attribute is 0: the version (a trained model) is not one that a

@@ -11,7 +11,7 @@ from __future__ import annotations
 import copy
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol, Self, runtime_checkable
 
 import numpy as np
@@ -24,11 +24,10 @@ from ..decision.neighbours import CERTAIN, UNCERTAIN
 from ..decision.policy import Policy
 from ..errors import SettingError, shortened
 from ..limits import ForceLimits
-from ..records import ACTIONS, Action, Arrays, Reason, State, TraceSpec
+from ..records import ACTIONS, Action, Arrays, Embedding, Reason, State, TraceSpec
 from ..reducers.base import FitReport, Floats, Ints, StopRule
 from ..traces import clip_extremes
 
-Embedding = tuple[tuple[float, ...], ...]  # (K, d)
 NOT_TRAINED = "Nothing was trained yet; report labels until the first retrain, then export."
 N_EXAMPLES = 8  # traces on which the answers of a version are compared with what was trained
 NO_TRACES: Floats = np.zeros((0, 1, 1), np.float32)
@@ -180,8 +179,7 @@ class EngineModel(ABC):
             n_failure, embedding, propensity), as `Decider.forward` returns them. The embedding is
             empty, shape (0, 0).
         """
-        verdict: Verdict = self.decider(conditions)(torch.from_numpy(x), part_hash)
-        return verdict
+        return self.decider(conditions).forward(torch.from_numpy(x), part_hash)
 
     def decider(self, conditions: DecisionConditions | None) -> Decider:
         """Return the module that decides under these conditions, and keep it for the next call.
@@ -391,7 +389,6 @@ class BaselineAdapter(EngineModel):
                 f"Expected a baseline, got a {type(model).__name__}; describe dengine's own model "
                 "by reducer=, policy= and recipe=."
             )
-        self.model = model
         self.user_model = model
         self.name = type(model).__name__
         self.description = type(model).__qualname__
@@ -401,7 +398,7 @@ class BaselineAdapter(EngineModel):
 
         Extreme samples are clipped first. Hashes, `stop` and numbers have no effect. Returns self.
         """
-        self.model.fit(clip_extremes(X).copy(), y)
+        self.user_model.fit(clip_extremes(X).copy(), y)
         return self
 
     def build_decider(self, conditions: Any) -> Decider:
@@ -410,7 +407,7 @@ class BaselineAdapter(EngineModel):
         It is not compiled, has no embedding, and asks the very object, so what the baseline learns
         later counts.
         """
-        return Decider(BaselinePredictor(self.model), conditions)
+        return Decider(BaselinePredictor(self.user_model), conditions)
 
     def add_reference(self, x: Floats, y: int, *_: object, **__: object) -> Floats:
         """Pass the labelled trace to the baseline's `add`, which changes the baseline in place.
@@ -418,12 +415,12 @@ class BaselineAdapter(EngineModel):
         Extreme samples are not clipped here. Returns the trace itself, in place of a reference
         point. Number, hash, embedding and point have no effect.
         """
-        self.model.add(x, y)
+        self.user_model.add(x, y)
         return x
 
     def successor(self) -> BaselineAdapter:
         """Return an adapter around a deep copy of the baseline, with what it has learned."""
-        return BaselineAdapter(copy.deepcopy(self.model))
+        return BaselineAdapter(copy.deepcopy(self.user_model))
 
 
 class BaselinePredictor(nn.Module):
@@ -480,6 +477,8 @@ class Exportable:
         A fitted model.
     trace : TraceSpec
         What the traces look like.
+    examples : array of float32, shape (n, C, T)
+        Traces on which the embeddings of the exported decider are compared with the reducer's.
     audit_rate : float
         Share of the certain decisions that are verified as audits.
     seed : int
@@ -490,19 +489,17 @@ class Exportable:
         The force limits of the policy.
     model_version, recipe : int, str
         Version and recipe that the exported file names; 0 and "" if no engine made the model.
-    examples : array of float32, shape (n, C, T)
-        Traces on which the embeddings of the exported decider are compared with the reducer's.
     note : callable, optional
         Called with the kind and the text of an event, to record the export.
     """
 
     model: Any
     trace: TraceSpec
+    examples: Floats
     audit_rate: float = 0.0
     seed: int = 0
     stops_all: bool = False
     force_limits: tuple[ForceLimits, ...] = ()
     model_version: int = 0
     recipe: str = ""
-    examples: Floats = field(default_factory=lambda: NO_TRACES)
     note: Callable[[str, str], object] | None = None

@@ -46,7 +46,17 @@ from ..decision.scripting import (
 from ..errors import StoreError, expect
 from ..folds import content_hash, fold_of
 from ..recipe import NOVELTY, Recipe
-from ..records import ACTIONS, REASONS, REPEATS, Arrays, Reason, State, TraceSpec, as_success
+from ..records import (
+    ACTIONS,
+    REASONS,
+    REPEATS,
+    Arrays,
+    Embedding,
+    Reason,
+    State,
+    TraceSpec,
+    as_success,
+)
 from ..reducers import class_default, make_reducer
 from ..reducers.base import (
     SAME_POINTS,
@@ -62,7 +72,6 @@ from ..traces import ForceLimitsGate, as_labels, as_traces, clip_extremes
 from .base import (
     N_EXAMPLES,
     NO_TRACES,
-    Embedding,
     EngineModel,
     Prediction,
 )
@@ -118,7 +127,7 @@ class Predictor(nn.Module):
         self.register_buffer("scale", scale[:, None])
         self.scaled = bool((scale != 1.0).any())
         self.novelty = novelty
-        self.neighbours: RadiusNeighbours = neighbours
+        self.neighbours = neighbours
         self.novel = NOVEL
 
     @torch.jit.export
@@ -222,19 +231,14 @@ def _as_key(value: object) -> object:
     """
     if isinstance(value, FUNCTIONS):
         return value
+    if isinstance(value, CONSTANTS):
+        return repr(value)
+    if isinstance(value, Tensor):
+        return tuple(value.shape)
     if not isinstance(value, list | tuple | dict):
         return None
-    keys: list[tuple[str, object]] = []
-    for name, item in value.items() if isinstance(value, dict) else enumerate(value):
-        key: object
-        if isinstance(item, CONSTANTS):
-            key = repr(item)
-        elif isinstance(item, Tensor):
-            key = tuple(item.shape)
-        else:
-            key = _as_key(item)
-        keys.append((repr(name), key))
-    return (type(value), *sorted(keys))
+    items = value.items() if isinstance(value, dict) else enumerate(value)
+    return (type(value), *sorted((repr(name), _as_key(item)) for name, item in items))
 
 
 def compiled(eager: Decider, warm_up_shape: tuple[int, ...]) -> Any:
@@ -540,13 +544,11 @@ class ModelPrediction(EngineModel):
         if not isinstance(previous, ModelPrediction):
             return
         conditions = previous._conditions or self._conditions
-        is_built = self._decider is not None and self.rule is previous.rule
-        is_built = is_built and conditions == self._conditions
-        self.rule = previous.rule
+        if self.rule is not previous.rule:
+            self.rule = previous.rule
+            self._decider = None
         self.rule_is_stale = self.rule_is_stale or previous.rule_is_stale
-        if not is_built:
-            self._decider = self.build_decider(conditions)
-            self._conditions = conditions
+        self.decider(conditions)
 
     def build_decider(self, conditions: DecisionConditions | None) -> Decider:
         """Build a decider, the module that decides on a trace, for this model.
@@ -772,9 +774,10 @@ class ModelPrediction(EngineModel):
         what `build_decider` raises (ValueError or AttributeError if nothing was fitted).
         """
         with torch.inference_mode():
-            predicted = self.predictor(torch.from_numpy(x), hash_)
+            action, reason, lower, upper, n_success, n_failure, z = self.predictor(
+                torch.from_numpy(x), hash_
+            )
         self._check_rule()
-        action, reason, lower, upper, n_success, n_failure, z = predicted
         embedding = tuple(map(tuple, z.tolist()))
         return Prediction(
             ACTIONS[action], lower, upper, n_success, n_failure, embedding, REASONS[reason]
@@ -811,7 +814,7 @@ class ModelPrediction(EngineModel):
         decider = self.decider(conditions)
         # As `torch.inference_mode`, whose entering costs 3 % of a decision.
         with torch._C._InferenceMode(True):
-            verdict: Verdict = decider.forward(torch.from_numpy(x), part_hash)
+            verdict = decider.forward(torch.from_numpy(x), part_hash)
         if verdict[0] == 0:  # a faulty trace does not ask the rule
             self._check_rule()
         return verdict
@@ -836,9 +839,9 @@ class ModelPrediction(EngineModel):
         an array of int64, shape (n,); 0 for a novel trace. No part is excluded, so a reference
         counts itself. Raises TraceError for another shape, and what `predict_one` raises.
         """
-        counts = [(p.n_success, p.n_failure) for p in self.predict_many(X)]
-        n_success, n_failure = np.array(counts, dtype=np.int64).reshape(-1, 2).T
-        return n_success, n_failure
+        predictions = self.predict_many(X)
+        n_success = np.array([prediction.n_success for prediction in predictions], np.int64)
+        return n_success, np.array([prediction.n_failure for prediction in predictions], np.int64)
 
     def predict_interval(self, X: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return (lower, upper), each float64 (n,): the bounds of each trace's success probability.
@@ -846,9 +849,9 @@ class ModelPrediction(EngineModel):
         X has the shape (n, samples) or (n, channels, samples). The bound is (0, 1) for a novel
         trace. Raises TraceError for another shape, and what `predict_one` raises.
         """
-        bounds = [(p.lower, p.upper) for p in self.predict_many(X)]
-        lower, upper = np.array(bounds, dtype=np.float64).reshape(-1, 2).T
-        return lower, upper
+        predictions = self.predict_many(X)
+        lower = np.array([prediction.lower for prediction in predictions])
+        return lower, np.array([prediction.upper for prediction in predictions])
 
     def decide(self, X: ArrayLike) -> NDArray[Any]:
         """Return an array of `Action`, shape (n,): what the model would do with each trace.
@@ -972,7 +975,7 @@ class ModelPrediction(EngineModel):
         return self.__dict__ | {"_decider": None}
 
 
-def near_repeats(traces: Floats, parts: NDArray[np.int64]) -> int:
+def near_repeats(traces: Floats, parts: Ints) -> int:
     """Count the traces among the newest 500 that nearly repeat a trace of another part.
 
     Labels are counted as independent trials, so a part that comes again must be given the number by
@@ -1013,13 +1016,12 @@ def near_repeats(traces: Floats, parts: NDArray[np.int64]) -> int:
     rows = torch.from_numpy(scaled.reshape(n, -1))
     distances = torch.cdist(rows, rows).numpy()
     distances[parts[:, None] == parts] = np.inf
-    nearest = distances.min(1)
     # A quarter of the time of `kthvalue`.
     eleventh = np.partition(distances, NEIGHBOURS)[:, NEIGHBOURS]
-    return int(((nearest < NEAR * eleventh) & (eleventh > 1e-6)).sum())
+    return int(((distances.min(1) < NEAR * eleventh) & (eleventh > 1e-6)).sum())
 
 
-def repeats_note(traces: Floats, parts: NDArray[np.int64]) -> str:
+def repeats_note(traces: Floats, parts: Ints) -> str:
     """Return a note for the report of a retrain if many traces nearly repeat another, else "".
 
     The note advises to give the parts' numbers, by which a part is known when it comes again,
