@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.testing import assert_array_equal
 from sklearn.base import BaseEstimator, clone
 
 from .cells.replay import ReplayCell
@@ -105,17 +106,17 @@ def it_embeds_every_trace_in_every_space(reducer: Any) -> None:
     )
     Z = trained.embed(Q)
     fold = np.arange(20) % trained.n_spaces
-    np.testing.assert_array_equal(
+    assert_array_equal(
         _train_clone(reducer).embed(Q), Z, err_msg="two fits differ: give it a random_state"
     )
-    np.testing.assert_array_equal(trained.embed_references(Q, fold), Z[np.arange(20), fold])
+    assert_array_equal(trained.embed_references(Q, fold), Z[np.arange(20), fold])
     is_shaped = Z.ndim == 3 and Z.shape[:2] == (20, trained.n_spaces)
     assert is_shaped, f"expected (n, K, d), 20 traces in {trained.n_spaces} spaces, got {Z.shape}"
     assert Z.dtype == np.float32, f"expected float32, got {Z.dtype}"
     assert np.isfinite(Z).all(), "a point is not finite"
     shape = np.asarray(trained.transform(Q)).shape
     assert shape == (20, Z.shape[2]), f"expected transform to give (20, {Z.shape[2]}), got {shape}"
-    np.testing.assert_array_equal(Q, QUERIES, err_msg="it writes to the caller's traces")
+    assert_array_equal(Q, QUERIES, err_msg="it writes to the caller's traces")
 
 
 def labels_of_a_fold_move_nothing_in_its_space(reducer: Any) -> None:
@@ -134,7 +135,7 @@ def labels_of_a_fold_move_nothing_in_its_space(reducer: Any) -> None:
     for k in range(trained.n_spaces):
         labels = y.copy()
         labels[fold == k] = np.random.default_rng(k).permutation(1 - y[fold == k])
-        np.testing.assert_array_equal(
+        assert_array_equal(
             _train_clone(reducer, times=2, labels=labels).embed(QUERIES)[:, k],
             Z[:, k],
             err_msg=f"labels of fold {k} moved space {k}",
@@ -173,7 +174,7 @@ def fit_starts_afresh(reducer: Any) -> None:
     B, labels_b = toy_traces(seed=2)
     once = as_reducer(clone(reducer), FOLDS).fit(B, labels_b)
     twice = as_reducer(clone(reducer), FOLDS).fit(A, labels_a).fit(B, labels_b)
-    np.testing.assert_array_equal(twice.transform(A), once.transform(A))
+    assert_array_equal(twice.transform(A), once.transform(A))
 
 
 def any_length_and_several_channels_work(reducer: Any) -> None:
@@ -248,7 +249,7 @@ def an_engine_resumes_with_identical_decisions(reducer: Any) -> None:
     X, y = toy_traces(110)
     recipe = Recipe(clone(reducer), policy=Policy(0.2, 0.8), retrain_every=70, folds=FOLDS)
     with TemporaryDirectory() as folder:
-        url = str(Path(folder) / "engine.db")
+        url = Path(folder) / "engine.db"
         with DataEngine(recipe=recipe, store=url, replaying=True) as engine:
             list(engine.run(ReplayCell(Dataset(X, y.astype(np.int8))), 90))
             first = engine.store.versions.retrains()[0]

@@ -18,11 +18,10 @@ from numpy.typing import ArrayLike, NDArray
 from ..decision.policy import Policy
 from ..errors import SettingError, expect
 from ..imports import import_class
-from ..records import Action, Floats, Ints, is_whole
+from ..records import Action, Floats, Ints, TraceArray, is_whole
 from ..traces import as_traces
 
 Labels = NDArray[np.bool_]
-Traces = NDArray[np.float32]
 
 
 class BaselinePrediction(NamedTuple):
@@ -173,17 +172,17 @@ class Baseline(ABC):
         return self._last[1]
 
     @abstractmethod
-    def _fit(self, X: Traces, good: Labels) -> bool:
+    def _fit(self, X: TraceArray, good: Labels) -> bool:
         """Train from scratch on traces (n, C, T) and labels (n,) of both classes, True for success.
 
         Return whether the labels were enough; if not, every part is verified.
         """
 
     @abstractmethod
-    def _predict(self, X: Traces) -> BaselinePrediction:
+    def _predict(self, X: TraceArray) -> BaselinePrediction:
         """Return the prediction for traces (n, C, T); called only after a successful training."""
 
-    def _add(self, X: Traces, good: bool) -> None:  # noqa: B027  # default: nothing
+    def _add(self, X: TraceArray, good: bool) -> None:  # noqa: B027  # default: nothing
         """Learn one trace (1, C, T) between two trainings; the default does nothing."""
 
 
@@ -204,10 +203,10 @@ class Constant(Baseline):
         self.is_trained = True
         return self
 
-    def _fit(self, X: Traces, good: Labels) -> bool:
+    def _fit(self, X: TraceArray, good: Labels) -> bool:
         return True
 
-    def _predict(self, X: Traces) -> BaselinePrediction:
+    def _predict(self, X: TraceArray) -> BaselinePrediction:
         return BaselinePrediction(np.full(len(X), self.lower), np.ones(len(X)))
 
 
@@ -271,15 +270,15 @@ class AgreeingNeighbours(Baseline):
         expect(is_whole(self.k, 1, 2**31), "k to be an integer of at least 1", self.k)
         self.thresholds = (1.0, 0.0)
 
-    def _fit(self, X: Traces, good: Labels) -> bool:
+    def _fit(self, X: TraceArray, good: Labels) -> bool:
         """Keep all labelled traces (n, C, T); return whether there are at least `k`."""
         self._references = LabelledPoints(_rows(X), good)
         return len(good) >= self.k
 
-    def _add(self, X: Traces, good: bool) -> None:
+    def _add(self, X: TraceArray, good: bool) -> None:
         self._references.add(_rows(X), good)
 
-    def _predict(self, X: Traces) -> BaselinePrediction:
+    def _predict(self, X: TraceArray) -> BaselinePrediction:
         """Return the share of successes among the k nearest labelled traces as both bounds.
 
         The counts are the numbers of successes and failures among the k. Of traces at the same
@@ -292,7 +291,7 @@ class AgreeingNeighbours(Baseline):
         return BaselinePrediction(share, share, n_success, self.k - n_success)
 
 
-def _rows(X: Traces) -> Floats:
+def _rows(X: TraceArray) -> Floats:
     """Return traces (n, C, T) as rows (n, C * T) of float64."""
     return X.reshape(len(X), -1).astype(np.float64)
 
@@ -329,7 +328,7 @@ def make_baseline(name: str, policy: Policy, seed: int = 0, **params: Any) -> Ba
     """
     kind = baseline_class(name)
     names = [item.name for item in fields(kind) if item.kw_only]
-    if unknown := ", ".join(sorted(set(params) - set(names))):
+    if unknown := ", ".join(sorted(params.keys() - names)):
         parameters = ", ".join(names) or "none"
         raise SettingError(f"The baseline {name} has no parameter {unknown}; it has {parameters}.")
     return kind(policy, seed, **params)
@@ -344,8 +343,7 @@ def baseline_class(name: str) -> type[Baseline]:
     """
     kind = import_class(name) if ":" in name else BASELINES.get(name, object)
     if not issubclass(kind, Baseline):
-        names = ", ".join(BASELINES)
         raise SettingError(
-            f"Expected a baseline among {names}, or module:Class of one, got {name}."
+            f"Expected a baseline among {', '.join(BASELINES)}, or module:Class of one, got {name}."
         )
     return kind

@@ -34,7 +34,7 @@ from scipy.stats import t as student
 from ..datasets import Dataset, load_dataset
 from ..decision.intervals import normal_quantile, wilson_interval
 from ..decision.policy import AUDIT_RATE, RULES, Policy, Settings
-from ..errors import SettingError, amount, expect, percent
+from ..errors import SettingError, amount, capitalized, expect, percent
 from ..files import FilePath
 from ..records import Floats
 from .grid import Task, play_tasks
@@ -291,7 +291,7 @@ class CostCurve:
             )
         if not self.fresh:
             text += " The search was not finished: these shuffles also chose the policy."
-        return text[0].upper() + text[1:]
+        return capitalized(text)
 
     @property
     def price_sentence(self) -> str:
@@ -559,8 +559,11 @@ def find_policy(
     _check_search(data, costs, repeats)
     n_cycles = len(data) if cycles is None else cycles
     contender = contender.with_policy(shadow=False)
-    changes = candidates(contender, costs, alphas, lower_bounds)
-    policies, out_of_reach = _within_reach(contender, changes, n_cycles * float(data.y.mean()))
+    policies, out_of_reach = _within_reach(
+        contender,
+        candidates(contender, costs, alphas, lower_bounds),
+        n_cycles * float(data.y.mean()),
+    )
     expect(
         bool(policies),
         "recordings enough for one policy",
@@ -576,8 +579,10 @@ def find_policy(
         screened += played
         is_whole = len(played) == N_SCREENING * len(policies)
         if is_whole:
-            groups = _by_policy(screened)
-            rows = {policy: _policy_cost(policy, group, costs) for policy, group in groups.items()}
+            rows = {
+                policy: _policy_cost(policy, replays, costs)
+                for policy, replays in _by_policy(screened).items()
+            }
             policies.sort(key=lambda policy: rows[policy].screening_key)
             del policies[max(N_LAST, len(policies) // 2) :]
             seed += N_SCREENING
@@ -603,8 +608,9 @@ def _finished(replays: Iterable[Replay], policies: Sequence[Policy]) -> Groups:
     if there are fewer than two such shuffles.
     """
     groups = _by_policy(replays)
-    seeds = [{replay.seed for replay in groups.get(policy, ())} for policy in policies]
-    common = set.intersection(*seeds)
+    common = set.intersection(
+        *({replay.seed for replay in groups.get(policy, ())} for policy in policies)
+    )
     if len(common) < 2:
         return {}
     return {
@@ -674,7 +680,7 @@ def _within_reach(
     return list(dict.fromkeys(policies)), out_of_reach
 
 
-def _by_policy(replays: Iterable[Replay]) -> dict[Policy, list[Replay]]:
+def _by_policy(replays: Iterable[Replay]) -> Groups:
     """Return the replays of each policy, in their order.
 
     A replay is a recorded stream of parts, decided again; the policy is that of its recipe (the
@@ -746,7 +752,8 @@ def curve_of(
     chosen = _chosen_name(marked, verdict)
     changes = []
     for field in fields(costs):
-        for price in (0.5 * getattr(costs, field.name), 2.0 * getattr(costs, field.name)):
+        for factor in (0.5, 2.0):
+            price = factor * getattr(costs, field.name)
             _, other, other_verdict = _choose(groups, replace(costs, **{field.name: price}))
             name = _chosen_name(other, other_verdict)
             if name != chosen:
@@ -785,8 +792,7 @@ def _choose(groups: Groups, costs: Costs) -> tuple[list[PolicyCost], PolicyCost,
     cheapest = rows[0]
     marked = cheapest
     for row in rows[1:]:
-        is_safer = row.escaped < marked.escaped and row.expected_cost < costs.check
-        if is_safer:
+        if row.escaped < marked.escaped and row.expected_cost < costs.check:
             mean, error = _difference(groups[row.policy], groups[cheapest.policy], costs)
             if mean <= error * normal_quantile(2 * ERROR_LEVEL):  # one-sided
                 marked = row

@@ -26,7 +26,7 @@ from ..history.explain import Explanation
 from ..records import Action, Floats, TraceSpec
 from ..reducers import has_own_unit
 from .costs import CostCurve, policy_name
-from .replay import Replay
+from .replay import Bools, Replay
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Style = dict[str, Any]  # keywords of matplotlib's drawing functions
+Marks = dict[Any, tuple[str, Style]]  # label or action -> its name in the legend, its style
 
 BLUE = "#0072B2"
 RED = "#D55E00"
@@ -61,12 +62,12 @@ LABEL_STYLES = ((True, "good", GOOD, "-", "o"), (False, "bad", BAD, "--", "X"))
 CLEAR = 0.1  # band widths below which leaving the band is not marked
 FEWEST = 20  # a share of fewer parts jumps by more than 5 % with each part, and is not drawn
 # Drawn in this order, so that the few certain ones lie on top.
-ACTION_MARKS: dict[Any, tuple[str, Style]] = {
+ACTION_MARKS: Marks = {
     Action.VERIFY: ("verify", {"color": VERIFIED, "marker": "o", "s": 9}),
     Action.ACCEPT: ("accept", {"color": GOOD, "marker": "o", "s": 26}),
     Action.REJECT: ("reject", {"color": BAD, "marker": "X", "s": 30}),
 }
-TRUTH_MARKS: dict[Any, tuple[str, Style]] = {
+TRUTH_MARKS: Marks = {
     label: (f"{name} part", {"color": colour, "marker": marker, "s": 24})
     for label, name, colour, _, marker in LABEL_STYLES
 }
@@ -360,17 +361,15 @@ def curves(by_recipe: Mapping[str, Sequence[Replay]], title: str = "") -> Figure
         for i, level in enumerate(levels):
             axes.axhline(level, label="_" if i else f"{name} = {text} %", **LIMIT)
     finish(certain, 0, ylim=(0, 102), ylabel="certain\n[% of cycles]")
-    finish(precision, ylabel="precision\n[% of accepted]")
-    precision.set_ylim(max(0.0, min(precision.get_ylim()[0], bounds[0] - 1)), 100.5)
+    lowest = max(0.0, min(precision.get_ylim()[0], bounds[0] - 1))
+    finish(precision, ylim=(lowest, 100.5), ylabel="precision\n[% of accepted]")
     # At least half as much again above the tolerance: the panel shows whether errors keep to it.
     finish(
         errors,
         ylim=(0, max(errors.get_ylim()[1], 1.5 * tolerances[0])),
         ylabel="bad of accepted, good of\nrejected (dashed) [%]",
-    )
-    errors.set(
         xlabel=f"cycle (end of a window of {window}; a share of fewer than {FEWEST} parts is not "
-        "drawn)"
+        "drawn)",
     )
     figure.legend(handles=handles, loc="outside lower center", frameon=False, fontsize=SMALL)
     return figure
@@ -566,7 +565,7 @@ def data_picture(data: Dataset, title: str = "") -> Figure:
     example if two channels have the same name.
     """
     X = data.cube
-    finite: NDArray[np.bool_] = np.asarray(np.isfinite(X).all(axis=(1, 2)))
+    finite: Bools = np.asarray(np.isfinite(X).all(axis=(1, 2)))
     figure = blank(9.0, 7.6)
     above, below = figure.subfigures(2, 1, squeeze=False, height_ratios=(1, 1.1))[:, 0]
     labels = _axis_labels(data.spec)
@@ -584,7 +583,7 @@ def data_picture(data: Dataset, title: str = "") -> Figure:
     return figure
 
 
-def _draw_drift(figure: Any, data: Dataset, finite: NDArray[np.bool_], label: str) -> None:
+def _draw_drift(figure: Any, data: Dataset, finite: Bools, label: str) -> None:
     """Draw how a data set changes in its order: the share of good parts, the mean of each trace.
 
     `figure` is a Figure or SubFigure, which gets two axes. The upper one shows the share of good

@@ -217,9 +217,9 @@ def _classes_and_functions(reducer: Any) -> list[Any]:
     among its parameters.
     """
     params = reducer.get_params(deep=True).values()
-    estimators = [reducer, *(param for param in params if hasattr(param, "fit"))]
-    classes = [type(estimator) for estimator in estimators]
-    return list(dict.fromkeys([*classes, *(param for param in params if isfunction(param))]))
+    classes = (type(param) for param in params if hasattr(param, "fit"))
+    functions = (param for param in params if isfunction(param))
+    return list(dict.fromkeys([type(reducer), *classes, *functions]))
 
 
 def load_contenders(recipes: Sequence[Any]) -> list[Contender]:
@@ -334,8 +334,7 @@ def iterate_replays(
     missing.sort(key=lambda i: tasks[i].seed)
     for name in sorted({tasks[i].contender.baseline or "" for i in missing} - {""}):
         baseline_class(name)
-    parallel = Parallel(n_jobs=n_jobs, return_as="generator_unordered")
-    for i, played in parallel(
+    for i, played in Parallel(n_jobs=n_jobs, return_as="generator_unordered")(
         delayed(_play)(data, i, tasks[i], on_cycle if n_jobs == 1 else None) for i in missing
     ):
         if kept_replays is not None:
@@ -452,9 +451,8 @@ def grid_tasks(
     """
     seeds = list(seeds)
     names = ("interval", "alpha", "lower_bound")
-    combinations = product(load_contenders(recipes), intervals, alphas, lower_bounds)
     tasks = []
-    for contender, *settings in combinations:
+    for contender, *settings in product(load_contenders(recipes), intervals, alphas, lower_bounds):
         changes = {
             name: value for name, value in zip(names, settings, strict=True) if value is not None
         }
@@ -471,6 +469,5 @@ def play_tasks(
     Replays in the folder `keep` are read instead of played, and the others are added to it. Raises
     what `iterate_replays` raises; then nothing is returned, but finished replays stay in `keep`.
     """
-    played = iterate_replays(dataset, tasks, n_jobs=n_jobs, keep=keep)
-    replays = {position: replay for position, replay, _ in played}
-    return [replays[i] for i in range(len(tasks))]
+    played = sorted(iterate_replays(dataset, tasks, n_jobs=n_jobs, keep=keep))
+    return [item.replay for item in played]

@@ -106,6 +106,11 @@ def pooled_error(replays: Sequence[Any], side: str = "accepted", alpha: float = 
     return ErrorRate(n_decided, n_wrong, n_traces, rate, lower, upper)
 
 
+def share_right(n_wrong: int, n_decided: int) -> float:
+    """Return the share of right decisions, from 0 to 1; NaN if nothing was decided."""
+    return 1.0 - n_wrong / n_decided if n_decided else math.nan
+
+
 def _count_per_trace(replays: Sequence[Any], name: str, size: int) -> Floats:
     """Return for each trace of a data set in how many cycles of all replays a field was True.
 

@@ -26,6 +26,7 @@ from ..decision.neighbours import fade
 from ..decision.policy import Policy
 from ..engine.engine import DataEngine
 from ..errors import SettingError, expect
+from ..history.sentences import BOUNDED
 from ..recipe import RECIPES, Recipe
 from ..records import (
     ACTIONS,
@@ -42,7 +43,7 @@ from ..records import (
 from ..reducers import has_own_unit
 from ..reducers.base import Reducer
 from .baselines import BASELINES, make_baseline
-from .metrics import VERIFY_SECONDS, Costs
+from .metrics import VERIFY_SECONDS, Costs, share_right
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -59,8 +60,6 @@ DECISION_FIELDS: dict[str, Any] = {
     "n_success": np.int64,
     "n_failure": np.int64,
 }
-# Reasons of decisions for which the model was asked.
-ASKED = (Reason.CERTAIN, Reason.UNCERTAIN, Reason.AUDIT, Reason.SAFE_MODE)
 # Fields of a replay that mark cycles, and are counted in its stretches.
 COUNTED = (
     "verified",
@@ -225,10 +224,10 @@ class Replay:
         """Return one line: name, policy, cycles, decisions, errors, and dropped retrains if any."""
         counts = self.stretch()
         summary = ", ".join(f"{counts[name]} {name.replace('_', ' ')}" for name in COUNTED[:5])
-        cycles = f"{self.recipe.policy.summary}, {len(self)} cycles"
         if self.dropped:
             summary += f"; {len(self.dropped)} retrains dropped, the last {self.dropped[-1]}"
-        return f"<Replay of {self.name}: {cycles}, {summary}>"
+        policy = self.recipe.policy.summary
+        return f"<Replay of {self.name}: {policy}, {len(self)} cycles, {summary}>"
 
     @property
     def dropped(self) -> list[str]:
@@ -378,7 +377,6 @@ class Replay:
         false_positive = counts["false_positive"]
         false_negative = counts["false_negative"]
         certain = accepted + rejected
-        n_wrong = false_positive + false_negative
         retrain_seconds = np.array([report.seconds for report in self.retrains])
         costs = Costs(check_seconds)
         dropped = self.dropped
@@ -398,9 +396,9 @@ class Replay:
             "certain": certain,
             "first_certain": first_certain,
             **{name: counts[name] for name in COUNTED[1:]},
-            "precision": 1.0 - false_positive / accepted if accepted else nan,
-            "npv": 1.0 - false_negative / rejected if rejected else nan,
-            "accuracy": 1.0 - n_wrong / certain if certain else nan,
+            "precision": share_right(false_positive, accepted),
+            "npv": share_right(false_negative, rejected),
+            "accuracy": share_right(false_positive + false_negative, certain),
             "retrains": len(self.retrains),
             "retrains_dropped": len(dropped),
             "dropped": dropped[-1] if dropped else "",
@@ -647,7 +645,7 @@ def replay_policy(scores: Replay, policy: Policy) -> Replay:
     # A rule that only sorts takes the mean probability of the heads, if there is one.
     is_scored = rule.sorts and has_own_unit(scores.recipe.reducer)
     audited = np.random.default_rng(scores.seed).random(len(scores)) < policy.audited_share
-    asked = np.isin(scores.reason, ASKED)
+    asked = np.isin(scores.reason, BOUNDED)
     novel = scores.novel
     actions = np.zeros(len(scores), dtype=np.int64)
     n_unreported = 0
@@ -657,12 +655,11 @@ def replay_policy(scores: Replay, policy: Policy) -> Replay:
             lower = 0.0
             upper = 1.0
             if asked[i] and is_scored:
-                score = float(scores.position[i, 0])
-                lower = upper = fade(score, i, rule.prior_labels)  # with i labels
+                # With i labels.
+                lower = upper = fade(float(scores.position[i, 0]), i, rule.prior_labels)
                 predicted = rule.action(lower, upper)
             elif asked[i]:
-                counts = int(scores.n_success[i]), int(scores.n_failure[i])
-                predicted, lower, upper = rule(*counts)
+                predicted, lower, upper = rule(int(scores.n_success[i]), int(scores.n_failure[i]))
             actions[i] = 0 if audited[i] else predicted
             if actions[i] == 2:  # nobody learns whether a rejected part was good
                 continue

@@ -109,8 +109,10 @@ def survey_dataset(data: Dataset) -> Survey:
     n_usable = int(usable.sum())
     parts: list[str | None] = [None] * len(data) if data.part is None else data.part.tolist()
     hashes = content_hash(X)
-    pairs = zip(hashes.tolist(), parts, strict=True)
-    part_hashes = np.array([trace_hash(content, part) for content, part in pairs], dtype=np.int64)
+    part_hashes = np.array(
+        [trace_hash(content, part) for content, part in zip(hashes.tolist(), parts, strict=True)],
+        dtype=np.int64,
+    )
     return Survey(
         **{
             name: getattr(data, name)
@@ -126,7 +128,7 @@ def survey_dataset(data: Dataset) -> Survey:
         not_finite_in=() if data.source is None else tuple(data.source[~finite].tolist()),
         constant=int(constant.sum()),
         too_large=int(too_large.sum()),
-        duplicates=n_usable - len({*hashes[usable].tolist()}),
+        duplicates=n_usable - len(np.unique(hashes[usable])),
         near_repeats=near_repeats(X[usable], part_hashes[usable]),
         looked_at=min(n_usable, NEWEST),
         parts=None if data.part is None else len(set(parts)),

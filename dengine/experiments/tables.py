@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 from ..errors import counted, percent
 from ..files import write_output
 from ..records import RetrainReport
-from .metrics import CYCLE_SECONDS, STOP_SECONDS, VERIFY_SECONDS, pooled_error
+from .metrics import CYCLE_SECONDS, STOP_SECONDS, VERIFY_SECONDS, pooled_error, share_right
 from .replay import POLICY_COLUMNS, Replay, Row
 
 if TYPE_CHECKING:
@@ -113,8 +113,8 @@ def pool(frame: pd.DataFrame, replays: Sequence[Replay]) -> list[Row]:
         row |= {name: float(part[name].mean()) for name in COUNTS}
         row |= {f"total_{name}": total for name, total in totals.items()}
         row |= {f"{name}_sd": float(part[name].std()) for name in ("certain", "false_positive")}
-        row["precision"] = _share_right(totals["false_positive"], totals["accepted"])
-        row["npv"] = _share_right(totals["false_negative"], totals["rejected"])
+        row["precision"] = share_right(totals["false_positive"], totals["accepted"])
+        row["npv"] = share_right(totals["false_negative"], totals["rejected"])
         row |= {name: float(part[name].agg(how)) for name, how in AGGREGATED.items()}
         row["retrains_dropped"] = int(part["retrains_dropped"].sum())
         error = pooled_error([replays[i] for i in part.index])
@@ -124,11 +124,6 @@ def pool(frame: pd.DataFrame, replays: Sequence[Replay]) -> list[Row]:
             row["promise_kept"] = bool(row["precision"] >= row["lower_bound"])
         rows.append(row)
     return rows
-
-
-def _share_right(n_wrong: int, n_decided: int) -> float:
-    """Return the share of right decisions, from 0 to 1; NaN if nothing was decided."""
-    return 1.0 - n_wrong / n_decided if n_decided else math.nan
 
 
 def promise_lines(rows: Sequence[Row]) -> list[str]:
@@ -223,20 +218,21 @@ def _whole(value: float) -> str:
     return "-" if math.isnan(value) else f"{value:.0f}"
 
 
-def _with_sd(row: Row, name: str) -> str:
-    """Return the mean `name` of a pooled row as text, ± its standard deviation over the replays.
+def _certain_with_sd(row: Row) -> str:
+    """Return the mean `certain` of a pooled row as text, ± its standard deviation over the replays.
 
     Both are rounded to integers. For one replay it is the mean alone, with one decimal.
     """
-    deviation = row[f"{name}_sd"]
-    return f"{row[name]:.1f}" if math.isnan(deviation) else f"{row[name]:.0f}±{deviation:.0f}"
+    mean = row["certain"]
+    deviation = row["certain_sd"]
+    return f"{mean:.1f}" if math.isnan(deviation) else f"{mean:.0f}±{deviation:.0f}"
 
 
 # Column of the screen's table -> its cell for a pooled row.
 CELLS: dict[str, Any] = {
     "alpha\nLB": lambda row: f"{row['alpha']:g}\n{100 * row['lower_bound']:g} %",
     "certain\nshare": lambda row: (
-        f"{_with_sd(row, 'certain')}\n{percent(row['total_certain'] / row['cycles'])}"
+        f"{_certain_with_sd(row)}\n{percent(row['total_certain'] / row['cycles'])}"
     ),
     "accept\nFP": lambda row: f"{row['accepted']:.1f}\n{row['false_positive']:.2f}",
     "reject\nFN": lambda row: f"{row['rejected']:.1f}\n{row['false_negative']:.2f}",

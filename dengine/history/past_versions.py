@@ -168,7 +168,7 @@ def _score_novelty(stored: ModelVersion, item: StoredDecision | None) -> Novelty
     """
     if item is None or item.decision.reason is not Reason.NOVEL:
         return None
-    gate = NoveltyGate(*(int(n) for n in stored.state["trace_shape"]))
+    gate = NoveltyGate(*stored.state["trace_shape"].tolist())
     gate.disabled = False
     try:
         restore(gate, arrays_with_prefix(stored.state, "novelty."))
@@ -218,8 +218,8 @@ def _restore_thresholds(
     or a user's rule is not imported), or if the rule is no `MemberRule`: only rules of this class
     have thresholds. Raises what `_restore_rule` raises, and what a user's rule raises in an update.
     """
-    has_state = bool(arrays_with_prefix(stored.state, "rule."))
-    if (policy.guarantee, policy.stops) == ("local", "some") and not has_state:
+    is_local = (policy.guarantee, policy.stops) == ("local", "some")
+    if is_local and not arrays_with_prefix(stored.state, "rule."):
         return policy.lower_bound, policy.lower_bound  # the paper's rule learns nothing
     rule = _restore_rule(stored, policy)
     if not isinstance(rule, MemberRule):
@@ -227,7 +227,8 @@ def _restore_thresholds(
     for label in later:
         if not label.quarantined and label.source is not Source.INSPECTION:
             _update_rule(rule, label)
-    return float(rule.evidence.thresholds[0]), float(rule.evidence.thresholds[1])
+    accept_threshold, reject_threshold = rule.evidence.thresholds.tolist()
+    return accept_threshold, reject_threshold
 
 
 def load_rule(store: SqlStore, policy: Policy) -> DecisionRule | None:
@@ -273,8 +274,9 @@ def load_rule(store: SqlStore, policy: Policy) -> DecisionRule | None:
     settings = store.settings.read()
     if stored is None or (rule := _restore_rule(stored, policy)) is None:
         return None
-    names = ("evidence_since", "began_in", "policy_since")
-    since, began_in, policy_since = (int(settings.get(name, 0)) for name in names)
+    since, began_in, policy_since = (
+        int(settings.get(name, 0)) for name in ("evidence_since", "began_in", "policy_since")
+    )
     progress = read_rule_progress(store, stored, since, policy.label_within, policy_since)
     if not progress.last_seq:  # rebuilt from all outcomes, as when an engine is opened
         rule = rule.clone()

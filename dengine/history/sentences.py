@@ -21,6 +21,7 @@ from ..store.records import StoredDecision
 from ..traces import LARGEST, WITHIN_LIMITS, ForceLimitsGate
 from .past_versions import Novelty, Thresholds
 
+# Reasons of decisions for which the model was asked, so that there are bounds.
 BOUNDED = (Reason.CERTAIN, Reason.UNCERTAIN, Reason.AUDIT, Reason.SAFE_MODE)
 DID = {Action.ACCEPT: "accepted", Action.REJECT: "rejected", Action.VERIFY: "verified"}
 
@@ -150,8 +151,7 @@ def explain_in_words(
     these limits does not fit the trace.
     """
     decision = item.decision
-    reason = _explain_reason(decision, item.trace, circumstances)
-    yield DID[decision.action].capitalize() + reason
+    yield DID[decision.action].capitalize() + _explain_reason(decision, item.trace, circumstances)
     if bound is not None:
         yield from _bound_sentences(decision, bound, circumstances)
     if item.success is None:
