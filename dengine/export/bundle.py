@@ -42,7 +42,7 @@ from ..errors import ExportError, instead
 from ..files import UNREADABLE, FilePath, check_output, read_key, write_output
 from ..model.base import N_EXAMPLES, NOT_TRAINED, Exportable
 from ..model.neighbours import ModelPrediction, compare_points
-from ..records import Action, Reason, TraceSpec
+from ..records import ACTIONS, REASONS, TraceSpec
 from .decision import FIELDS, DecisionModule
 
 PREFIX = "hmac-sha256:"
@@ -182,7 +182,7 @@ def prepare_export(
     return source, DecisionModule(source.trace, decider, model.n_spaces, source.stops_all)
 
 
-def exportable(engine_or_model: Any, trace: TraceSpec | None = None) -> Exportable:
+def exportable(engine_or_model: Any, trace: TraceSpec | None) -> Exportable:
     """Return the model that decides at present, with the engine's settings, for an exporter.
 
     `engine_or_model` is a `DataEngine` or a `ModelPrediction`. Of an engine the result has the rate
@@ -210,17 +210,17 @@ def exportable(engine_or_model: Any, trace: TraceSpec | None = None) -> Exportab
     if model is None or not hasattr(model, "trace_shape"):
         raise ExportError(NOT_TRAINED)
     if engine is None:
-        return Exportable(model, trace or model.trace_spec, examples=model.examples)
+        return Exportable(model, trace or model.trace_spec, model.examples)
     return Exportable(
         model,
         trace or engine.trace or model.trace_spec,
+        engine.store.labels.with_traces(N_EXAMPLES).traces,
         audit_rate=engine.policy.audited_share,
         seed=engine.seed,
         stops_all=engine.policy.stops == "all",
         force_limits=engine.policy.limits,
         model_version=engine.version,
         recipe=engine.recipe.to_toml(),
-        examples=engine.store.labels.with_traces(N_EXAMPLES).traces,
         note=engine._outbox.record_event,  # it waits for no database
     )
 
@@ -262,8 +262,8 @@ def describe(source: Exportable) -> Metadata:
         "references": len(index),
         "references_sha256": index.digest(),
         "fields": list(FIELDS),
-        "actions": [str(a) for a in Action],
-        "reasons": [str(r) for r in Reason],
+        "actions": list(ACTIONS),
+        "reasons": list(REASONS),
         "safe_modes": list(SAFE_MODES),
         "model_version": source.model_version,
         "recipe": source.recipe,
@@ -336,7 +336,7 @@ def _check_outputs(path: FilePath, force: bool) -> None:
 
     With `force` they may replace files. The signature is checked even if there is no key.
     """
-    for file in (Path(path), sibling_path(path, "sha256"), sibling_path(path, "sig")):
+    for file in (path, sibling_path(path, "sha256"), sibling_path(path, "sig")):
         check_output(file, force)
 
 

@@ -9,12 +9,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from ..decision.decider import Decider
-from ..records import FITS, REASONS, ActionCode, Reason, TraceSpec
+from ..decision.decider import Decider, Predicted
+from ..records import FITS, ActionCode, TraceSpec
 from ..traces import can_fit_length, fit_length
 
-# action, reason, lower, upper, n_success, n_failure, embedding
-DecisionFields = tuple[int, int, float, float, int, int, Tensor]
 FIELDS = ("action", "reason", "lower", "upper", "n_success", "n_failure", "embedding")
 
 
@@ -59,10 +57,10 @@ class DecisionModule(nn.Module):
     spec : TraceSpec
         Shape of the traces, and how other lengths are fitted to it.
     decider : Decider
-        Eager or compiled; its predictor has `neighbours`, like `model.neighbours.Predictor`.
+        Eager or compiled; its predictor is a `model.neighbours.Predictor`.
     n_spaces : int
         K, the number of embedding spaces.
-    stops_all : bool, default False
+    stops_all : bool
         Whether the next `decide` confirms an accepted part of which nothing was reported.
 
     Attributes
@@ -83,7 +81,7 @@ class DecisionModule(nn.Module):
         spec: TraceSpec,
         decider: Decider,
         n_spaces: int,
-        stops_all: bool = False,
+        stops_all: bool,
     ) -> None:
         super().__init__()
         self.decider = decider
@@ -92,15 +90,12 @@ class DecisionModule(nn.Module):
         self.fit = FITS.index(spec.fit)
         self.n_spaces = n_spaces
         self.stops_all = stops_all
-        self.audit_reason = REASONS.index(Reason.AUDIT)
-        self.novel_reason = REASONS.index(Reason.NOVEL)
-        self.outside_reason = REASONS.index(Reason.OUTSIDE)
         self.pending = None
         self.last_predicted = ActionCode.VERIFY.value
         self.n_unreported = 0
 
     @torch.jit.export
-    def decide(self, trace: Tensor, part: int = 0) -> DecisionFields:
+    def decide(self, trace: Tensor, part: int = 0) -> Predicted:
         """Decide on one trace, and make this the pending decision: its outcome is not known yet.
 
         Before that, an accept that is still pending is settled (`settle`): with `stops_all` (every
@@ -153,7 +148,7 @@ class DecisionModule(nn.Module):
             )
         return action, reason, lower, upper, n_success, n_failure, z
 
-    def forward(self, trace: Tensor, part: int = 0) -> DecisionFields:
+    def forward(self, trace: Tensor, part: int = 0) -> Predicted:
         """Do and return what `decide` does; a loaded module that is called runs this method."""
         return self.decide(trace, part)
 
@@ -200,8 +195,9 @@ class DecisionModule(nn.Module):
                 (
                     _, _, action, predicted, reason, lower, upper, _, _, z, _,
                 ) = self.decider(x, part)  # fmt: skip
-                decided = DecidedTrace(action, predicted, part, content, reason, lower, upper, z)
-                self.learn_outcome(decided, success)
+                self.learn_outcome(
+                    DecidedTrace(action, predicted, part, content, reason, lower, upper, z), success
+                )
         return self.n_references()
 
     @torch.jit.export
@@ -264,8 +260,8 @@ class DecisionModule(nn.Module):
         x = self.as_trace(trace)
         self.settle()
         fault, content = self.decider.check(x)
-        predicted = 0 if reason == self.outside_reason else action
-        if reason == self.audit_reason:
+        predicted = 0 if reason == self.decider.outside_reason else action
+        if reason == self.decider.audit_reason:
             predicted = self.decider.predictor.neighbours.rule.action(lower, upper)
         self.last_predicted = predicted
         self.pending = None
@@ -316,8 +312,9 @@ class DecisionModule(nn.Module):
         if decided.action == ActionCode.VERIFY.value:
             audit_rate = float(self.decider.audit_rate.item())
             inclusion_probability = 1.0 if decided.predicted == decided.action else audit_rate
-        neighbours = self.decider.predictor.neighbours
-        neighbours.rule.observe(self.n_unreported, decided.reason == self.novel_reason)
+        predictor = self.decider.predictor
+        neighbours = predictor.neighbours
+        neighbours.rule.observe(self.n_unreported, decided.reason == predictor.novel)
         neighbours.rule.update(
             decided.lower, decided.upper, success, decided.predicted, inclusion_probability
         )

@@ -335,8 +335,9 @@ class OnnxDecision(nn.Module):
         is_inside = distances <= self.radius * self.radius
         n_success = (is_inside & (self.labels == 1)).sum()
         n_failure = (is_inside & (self.labels == 0)).sum()
-        limits = ARRAY_LIMITS[self.rule.interval]
-        lower, upper = limits(torch, n_success.double(), n_failure.double(), self.rule.z)
+        lower, upper = ARRAY_LIMITS[self.rule.interval](
+            torch, n_success.double(), n_failure.double(), self.rule.z
+        )
         rejects = torch.where(upper <= self.rule.reject_threshold, 2, 0)
         action = torch.where(lower >= self.rule.accept_threshold, 1, rejects)
         return action, lower, upper, n_success, n_failure
@@ -350,14 +351,19 @@ def _to_onnx(decision: OnnxDecision, spec: TraceSpec) -> Any:
     missing. Raises ExportError if torch makes no program; errors of torch are raised as they are.
     """
     example = (torch.from_numpy(golden_trace(spec)),)
-    options: dict[str, Any] = {"dynamo": True, "opset_version": OPSET, "verbose": False}
     level = logging.root.manager.disable
     logging.disable(logging.WARNING)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             program = torch.onnx.export(
-                decision, example, input_names=["trace"], output_names=list(FIELDS), **options
+                decision,
+                example,
+                input_names=["trace"],
+                output_names=FIELDS,
+                dynamo=True,
+                opset_version=OPSET,
+                verbose=False,
             )
     finally:
         logging.disable(level)

@@ -171,10 +171,10 @@ def golden_trace(spec: TraceSpec) -> TraceArray:
     if spec.limit is not None and spec.limit <= 2.0 * LARGEST:
         amplitude = 0.5 * spec.limit
     x = np.sin(np.arange(spec.channels * spec.samples, dtype=np.float32) / 7.0)
-    return (x * np.float32(amplitude)).reshape(spec.channels, spec.samples)
+    return np.asarray(x * np.float32(amplitude)).reshape(spec.channels, spec.samples)
 
 
-def golden_answer(trace: TraceArray, embedding: NDArray[np.float32]) -> dict[str, Any]:
+def golden_answer(trace: TraceArray, embedding: NDArray[np.float32]) -> Metadata:
     """Return the golden trace with its embedding (K, d), as a dict for JSON.
 
     Raises ExportError if the embedding is not finite, because no loader could compare it.
@@ -259,8 +259,9 @@ class ExportedModel:
         """
         x = torch.from_numpy(as_trace(trace, self.trace))
         with torch.inference_mode():
-            decided = self.module.decide(x, _part_hash(part))
-        action, reason, lower, upper, n_success, n_failure, z = decided
+            action, reason, lower, upper, n_success, n_failure, z = self.module.decide(
+                x, _part_hash(part)
+            )
         return ExportedDecision(
             ACTIONS[action], REASONS[reason], lower, upper, n_success, n_failure, z.numpy()
         )
@@ -406,8 +407,9 @@ def _check_golden(model: ExportedModel, path: Path) -> None:
         embedding = model.decide(trace).embedding
         model.learn(trace, True)
         model.stop(trace)
-    same_shape = embedding.shape == expected.shape
-    if not same_shape or not np.allclose(embedding, expected, atol=TOLERANCE, rtol=TOLERANCE):
+    if embedding.shape != expected.shape or not np.allclose(
+        embedding, expected, atol=TOLERANCE, rtol=TOLERANCE
+    ):
         raise ExportError(
             f"{path} loads, but this machine does not reproduce its golden embedding; export it "
             "anew here."
