@@ -28,7 +28,7 @@ from dengine.errors import ReportError, StoreError
 from dengine.folds import part_hash
 from dengine.history.status import status
 from dengine.model.neighbours import repeats_note
-from dengine.store.records import NewLabel
+from dengine.store.records import Change, NewLabel
 from dengine.store.verification import verify_history
 from tests.support.driving import drive as play
 from tests.support.stores import execute
@@ -205,7 +205,7 @@ def test_of_a_safe_mode_whose_beginning_is_not_recorded_no_recovery_is_told(stre
     play(engine, spoiled(stream))
     assert engine.status(watching=True).watch.recovery
     # As if the earlier safe mode had ended, and the engine was killed as this one began.
-    engine._outbox.record_event("safe mode ended", "")
+    engine.store.corrections.apply(Change("safe mode ended", "fresh evidence"))
     assert engine.safe_mode
     assert engine.status(watching=True).watch.recovery == ""
 
