@@ -223,11 +223,9 @@ def _as_key(value: object) -> object:
     """Return a hashable key of an attribute for `structure_of`; None if it makes no difference.
 
     `structure_of` finds modules for which one compiled module can serve. A list, tuple or dict
-    gives its type and the sorted names and keys of its items. The key of an item is the text of a
-    constant (`CONSTANTS`, like a number or a text), the shape of a tensor, and else its own
-    `_as_key`. A function is its own key: its address would not do, since another function may get
-    it later. Any other value gives None. `structure_of` passes the dict of a module's attributes,
-    so constants and tensors come only as items.
+    gives its type and the sorted names and keys of its items. A constant (`CONSTANTS`, like a
+    number or a text) gives its text, and a tensor its shape. A function is its own key: its address
+    would not do, since another function may get it later. Any other value gives None.
     """
     if isinstance(value, FUNCTIONS):
         return value

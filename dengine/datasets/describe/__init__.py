@@ -133,7 +133,7 @@ def choose_files(p: Proposal, root: Path) -> bool:
         raise DataError(f"Expected files of recordings, {listed(SUFFIXES)}, in {root}, got none.")
     endings = likely_endings(names)
     expect_data(
-        stated or not {*endings} <= {*FOREIGN},
+        bool(stated or {*endings} - {*FOREIGN}),
         f"files that dengine reads in {root}",
         endings,
         "see the page 'Recordings that dengine does not read'",

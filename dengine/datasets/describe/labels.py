@@ -79,7 +79,9 @@ def with_meanings(source: LabelSource, words: Names) -> LabelSource:
     the name is; yes, 1 and their opposites have no known meaning there.
     """
     words = sorted({*words})
-    name = source.column or source.line or source.topic or ("" if lists_words(source) else source.path)
+    name = (
+        source.column or source.line or source.topic or ("" if lists_words(source) else source.path)
+    )
     groups: Sequence[Sequence[str]] = (GOOD, BAD, UNCHECKED)
     if name and {word.lower() for word in words} <= {*YES, *NO, *UNCHECKED}:
         groups = (YES, NO, UNCHECKED) if GOOD_NAME.fullmatch(name) else ((), (), UNCHECKED)
