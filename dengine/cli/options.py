@@ -704,12 +704,12 @@ def recorder_settings(options: Options) -> tuple[Values, TraceSpec]:
 
     An `RtdeRecorder` records traces of a Universal Robots controller; a `TraceSpec` says what
     shape, rate and unit traces have. Both come from the values of `--samples`, `--channels`,
-    `--rate-hz`, `--unit` and `--fit` in `options`, by the names in `TRACE`, as far as they were
-    given; other options are ignored. The settings are samples, rate_hz and channels, and those that
-    were not given are left out. The `TraceSpec` has the recorder's defaults for them (see
-    `spec_of_recording`), and also the unit and the fit (what is done with traces of another
-    length). Without `--unit` the unit of a force is N, and any other is unknown. Raises
-    SettingError for values that no trace can have.
+    `--rate-hz`, `--unit` and `--fit` in `options`, under samples, channel, rate_hz, unit and fit,
+    as far as they were given; other options are ignored. The settings are samples, rate_hz and
+    channels, and those that were not given are left out. The `TraceSpec` has the recorder's
+    defaults for them (see `spec_of_recording`), and also the unit and the fit (what is done with
+    traces of another length). Without `--unit` the unit of a force is N, and any other is unknown.
+    Raises SettingError for values that no trace can have.
     """
     from ..cells.ur.recorder import spec_of_recording
 

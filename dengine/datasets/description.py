@@ -13,6 +13,7 @@ import re
 import sys
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
+from copy import deepcopy
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
@@ -443,18 +444,19 @@ class Description:
         The keys `column`, `path`, `line`, `topic` and `listing` in `[label]` each say where the
         label stands: stating one clears the others, and likewise with `column`, `path` and `line`
         in `[part]`; words for good and bad stay. Stating a channel replaces the channel `?`. In
-        `rows.NAME.keep`, `channels.NAME.unit` and keys like these (`OF_COLUMN`) the name of a
-        column may have dots; any other key is split at its first dot. A key without a dot may be a
-        whole section, which its value then replaces. The notes stay. Raises DataError for an
-        unknown key or a wrong value, as `from_dict` does, if what stands before the dot in a key is
-        no section, and for a key like `check.column` if there is a `[[check]]` already.
+        `rows.NAME.keep`, `channels.NAME.unit` and keys like these (that end in drop, invalid,
+        factor or limit) the name of a column may have dots; any other key is split at its first
+        dot. A key without a dot may be a whole section, which its value then replaces. The notes
+        stay. Raises DataError for an unknown key or a wrong value, as `from_dict` does, if what
+        stands before the dot in a key is no section, and for a key like `check.column` if there is
+        a `[[check]]` (a source that must agree with the label) already.
         """
         values = self.to_dict()
         for section in ("label", "part"):
             if any(f"{section}.{source}" in stated for source in SOURCES):
                 for source in SOURCES:
                     values.get(section, {}).pop(source, None)
-        for name, value in stated.items():
+        for name, value in deepcopy(dict(stated)).items():
             of_column = OF_COLUMN.fullmatch(name)
             *steps, last = of_column.groups() if of_column else name.split(".", 1)
             table = values

@@ -211,11 +211,11 @@ def apply_correction(model: EngineModel, store: SqlStore, correction: Correction
     -------
     bool
         False if the model keeps references and cannot change this one: nothing is changed, and the
-        model must be trained again. True in all other cases, even if there was nothing to change:
-        the model is a baseline (handed in by the user), which keeps no references; the model has no
-        reference of this label any more; the trace has a fault and was never a reference; the
-        decision is another cell's and its trace is damaged; or the trace is damaged and would have
-        to be added again.
+        model must be trained again. True in all other cases, even if nothing is changed: the model
+        is a baseline (handed in by the user), which keeps no references; the model has no reference
+        of this label any more; the trace has a fault and was never a reference; the decision is
+        another cell's and its trace is damaged (the reference stays as it was); or the trace is
+        damaged and would have to be added again.
 
     Raises
     ------

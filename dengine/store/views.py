@@ -124,8 +124,9 @@ class DecisionGroup:
         "good" and "bad" are the label after corrections. "forgotten": there is a label, but a
         correction withdrew it. "overdue": a check was asked for, there is no label, and so many
         decisions followed that the check is overdue (`aged`; it is False if the decisions were
-        counted without the number `within`). "none": there is no label, and no check is overdue. A
-        check of a quarantined trace (stored, but never used in training) is never overdue.
+        counted without `within`, the number of later decisions that makes a check overdue). "none":
+        there is no label, and no check is overdue. A check of a quarantined trace (stored, but
+        never used in training) is never overdue.
         """
         if self.source is not None and self.success is None:
             return "forgotten"

@@ -144,7 +144,8 @@ def epoch_of(column: Column) -> str:
 
     In this unit the first number is a time in the years 2000 to 2049, counted from 1970 or from
     another day that clocks use, and the usual step (`Column.usual_step`) is that of a rate of 1 Hz
-    to 1 MHz. Of several such units the first in `EPOCHS` is returned.
+    to 1 MHz. Of several such units the first in `EPOCHS`, the list of those that are tried, is
+    returned.
     """
     for unit, zero in EPOCHS:
         scale = scale_of(unit)
