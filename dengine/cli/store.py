@@ -224,18 +224,19 @@ def policy(store: str, settings: dict[str, Any], author: str, allow_import: bool
     The policy is the settings of the decisions. Without options it is shown, even while an engine
     runs on the robot cell; a change is refused then. A change is recorded as an event in the
     store's log; settings that are in force already change nothing. A setting that is not given
-    stays as it is, with one exception: --prices without --guarantee also changes the guarantee from
-    local or pooled to cost, and then the audit rate (the share of parts of which the model is
-    certain and that are verified all the same) from 0 to 0.05, unless --audit-rate is given.
+    stays as it is, with one exception: --prices without --guarantee also changes the guarantee
+    (what is promised of the decisions) from local or pooled to cost, and then the audit rate (the
+    share of parts of which the model is certain and that are verified all the same) from 0 to 0.05,
+    unless --audit-rate is given.
 
     Earlier decisions keep their bounds. The certificate, which bounds the share of wrong decisions,
-    starts again after any change. The rule also forgets what it learned, after a change of --alpha,
-    --lower-bound, --interval, --guarantee, --stops or --prices, and, under pooled or cost with
-    --stops some, of --audit-rate: a tolerance (the share of wrong decisions that is allowed) that
-    is chosen after the data was seen needs fresh evidence. A store whose engine needs a model or
-    reducer that was handed in as an object is refused, with and without options. Shadow mode
-    (--shadow on) lasts over restarts; `dengine status` counts what the model would have done, and
-    how much of it was wrong.
+    starts again after any change. The rule that decides also forgets what it learned, after a
+    change of --alpha, --lower-bound, --interval, --guarantee, --stops or --prices, and, under the
+    guarantees pooled and cost with --stops some, of --audit-rate: a tolerance (the share of wrong
+    decisions that is allowed) that is chosen after the data was seen needs fresh evidence. A store
+    whose engine needs a model or reducer that was handed in as an object is refused, with and
+    without options. Shadow mode (--shadow on) lasts over restarts; `dengine status` counts what the
+    model would have done, and how much of it was wrong.
     """
     if settings:
         _change_and_print(

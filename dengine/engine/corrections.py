@@ -167,10 +167,11 @@ class Corrections:
         the store, and so do the versions that were trained with them. The version in force goes on,
         without references (labelled points) from these labels, until the next retrain, which starts
         from weights that never saw them. If a rollback pinned this version (so that no retrain
-        replaces it), and one of these labels is among those of its training or older than all of
-        them, it is released: it is stored as a new version, which retrains may replace, before the
-        labels are forgotten. A baseline (a model that the user handed in) is retrained before this
-        returns; if it stays pinned, it is fitted again as a new version.
+        replaces it), and it was trained with one of these labels, or one is older than all labels
+        of its training (an earlier version may have learned it), it is released: it is stored as a
+        new version, which retrains may replace, before the labels are forgotten. A baseline (a
+        model that the user handed in) is retrained before this returns; if it stays pinned, it is
+        fitted again as a new version.
 
         First the labels that wait are stored, and what other cells of the product (robot cells that
         share labels and versions) stored is taken in. A training under way in the executor is

@@ -752,14 +752,14 @@ class DataEngine(AbstractContextManager["DataEngine"]):
     def _cycle(self, cell: Cell, index: int) -> Cycle:
         """Run a cycle: insert a part, decide, act on the decision, and report the outcome.
 
-        `index` is the number of the cycle, from 0. The robot cell inserts the part, and then
-        verifies it, lets it go on or rejects it. A REJECT is not reported, nor is an ACCEPT if the
-        cell does not know its outcome. A label that cannot be written to the disk is logged, and
-        written later. A retrain that is due is begun or done (`poll`). An exception of the cell is
-        raised unchanged, and so are the other errors of `decide`, `report` and `poll`; ReportError
-        is raised if the cell returns no label or outcome. Returns the record of the cycle; its
-        `decide_seconds` is the duration of the decision alone, during which Python's garbage
-        collector is off.
+        `index` is the number of the cycle, from 0. The robot cell inserts the part, whose number is
+        its attribute `part`, if it has one, and then verifies it, lets it go on or rejects it. A
+        REJECT is not reported, nor is an ACCEPT if the cell does not know its outcome. A label that
+        cannot be written to the disk is logged, and written later. A retrain that is due is begun
+        or done (`poll`). An exception of the cell is raised unchanged, and so are the other errors
+        of `decide`, `report` and `poll`; ReportError is raised if the cell returns no label or
+        outcome. Returns the record of the cycle; its `decide_seconds` is the duration of the
+        decision alone, during which Python's garbage collector is off.
         """
         trace = cell.insert()
         with uncollected():

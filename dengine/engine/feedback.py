@@ -268,8 +268,9 @@ class Feedback:
     def _was_unreported(self, stored: StoredDecision) -> bool:
         """Return whether this part was counted as unreported: accepted, and nobody reported it.
 
-        It was, if it was accepted by a version under the present policy, which has stops="some"
-        (not every bad accepted part is reported), and the next trace came before its outcome.
+        It was, if a model version accepted it under the present policy (the settings of the
+        decisions), which has stops="some" (not every bad accepted part is reported), and the next
+        trace came before its outcome.
         """
         decision = stored.decision
         if decision.action is not Action.ACCEPT or self._stops_all:

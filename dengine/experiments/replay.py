@@ -429,9 +429,10 @@ def to_replay(observed: Sequence[ObservedCycle], recipe: Recipe) -> Replay:
     """Return observed cycles, in their order, as a `Replay`; it is empty if there are none.
 
     `observed` has pairs of a cycle (one part) and whether the part was good: 1.0, 0.0, or NaN if
-    unknown. `recipe` is the recipe of the engine that drove the robot cell. The fields that only a
-    replay of a recorded data set has (`index`, `dataset`, `seed`, `confirm`, `seconds`) keep their
-    defaults. `name` is the recipe's name, and `retrains` has the reports that the cycles carry.
+    unknown. `recipe` has the settings of the engine that drove the robot cell. The fields that only
+    a replay of a recorded data set has (`index`, `dataset`, `seed`, `confirm`, `seconds`) keep
+    their defaults. `name` is the recipe's name, and `retrains` has the reports that the cycles
+    carry.
     """
     cycles = [cycle for cycle, _ in observed]
     decisions = [cycle.decision for cycle in cycles]

@@ -184,8 +184,9 @@ def explain(store: SqlStore, decision_id: str, neighbours: int = 10) -> Explanat
         For a decision that the store does not hold (UnknownDecisionError), and for a part with
         several decisions that count (ReportConflictError).
     StoreError
-        For a store that no engine has used, for a stored recipe that lacks settings, for a damaged
-        `TraceSpec`, and for a damaged trace of the decision or of a neighbour.
+        For a store that no engine has used, for a stored recipe (the settings of an engine) that
+        lacks some, for a damaged `TraceSpec`, and for a damaged trace of the decision or of a
+        neighbour.
     SettingError
         For a stored recipe or policy that cannot be read, if an object of the user's class of
         decision rule cannot be made, and for a part outside the force limits (an operator's limits

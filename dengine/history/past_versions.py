@@ -256,8 +256,9 @@ def load_rule(store: SqlStore, policy: Policy) -> DecisionRule | None:
         of rule is not imported. Also None if the newest version has no arrays with the names and
         shapes of the rule's: another robot cell that shares the versions made it, it is a model
         that the user handed in, it was made under a policy whose rule has other arrays, or the rule
-        was stale (it had missed an update). A rule that learns nothing, like that of the guarantee
-        "local" with stops="some", has no arrays: another cell's version will do for it, and it is
+        was stale (it had missed an update). A rule that learns nothing, like that of a policy with
+        guarantee="local" (a promise on each part's neighbourhood) and stops="some" (not every bad
+        accepted part is reported), has no arrays: another cell's version will do for it, and it is
         never stale.
 
     Raises

@@ -29,8 +29,9 @@ async def playing(service: CellService, data: Any, seed: int) -> AsyncIterator[N
 
     The task plays each recording once, in place of a robot: it asks for a decision on each part,
     and reports the recorded result of parts that are to be checked (VERIFY), and of accepted bad
-    parts, which stop the line. During the first 150 parts (`N_FAST`) it waits for retrains that are
-    under way. It is cancelled when the block ends. Its errors are logged (see `drive`).
+    parts, which stop the line. The first 150 parts (`N_FAST`) wait only for retrains that are under
+    way; later parts come once a second. The task is cancelled when the block ends. Its errors are
+    logged (see `drive`).
 
     Parameters
     ----------

@@ -77,7 +77,7 @@ class EventTable(CellTable):
                 log.warning("%s (%s)", text, error)
 
     def newest(self, limit: int | None = None) -> list[Event]:
-        """Return the newest events of the robot cell, oldest first.
+        """Return the newest events (rows of the store's log) of the robot cell, oldest first.
 
         Parameters
         ----------

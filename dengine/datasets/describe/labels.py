@@ -281,19 +281,21 @@ def count_sources(p: Proposal, stated: Sequence[LabelSource]) -> dict[LabelSourc
 def propose_label(p: Proposal) -> None:
     """Set `[label]` and `[[check]]` in `p`: the source of the labels, and those that must agree.
 
-    A source is certain if it is named like a verdict (`is_named_like_verdict`) or stated, has words
-    for good and for bad, and all its words have a known meaning. The first certain source becomes
-    the label, unless another source contradicts it: good by one, bad by the other. If none is
-    certain, but only one is named like a verdict or stated, this source becomes the label. Its
-    `good` or `bad` is `?` if none of its words is known to mean that; a word of unknown meaning is
-    in neither list. But if any source has only known words, like "ok", it becomes the label only if
-    there is no other source. Sources that have the same word for each recording count as one here,
-    and the first that is named like a verdict is used. Otherwise `label.column` is `?`, with a note
-    that lists all sources. Further certain sources that have a word for each recording of the label
-    become checks, unless checks are stated; a note counts the words of the label, also on
-    `label.good` and `label.bad` if these are `?`. Raises DataError if a stated source has no words
-    or cannot be read, or, if none is stated, if cells of a column without another use are lists;
-    and SettingError for a malformed `windows.trigger`.
+    A source is a place where each recording has a word like "ok", such as a column, the path or a
+    listing (a file with a row for each recording). It is certain if it is named like a verdict
+    (`is_named_like_verdict`) or stated by the user, has words for good and for bad, and all its
+    words have a known meaning. The first certain source becomes the label, unless another source
+    contradicts it: good by one, bad by the other. If none is certain, but only one is named like a
+    verdict or stated, this source becomes the label. Its `good` or `bad` is `?` if none of its
+    words is known to mean that; a word of unknown meaning is in neither list. But if any source has
+    only known words, it becomes the label only if there is no other source. Sources that have the
+    same word for each recording count as one here, and the first that is named like a verdict is
+    used. Otherwise `label.column` is `?`, with a note that lists all sources. Further certain
+    sources that have a word for each recording of the label become checks, unless checks are
+    stated; a note counts the words of the label, also on `label.good` and `label.bad` if these are
+    `?`. Raises DataError if a stated source has no words or cannot be read, or, if none is stated,
+    if cells of a column without another use are lists; and SettingError for a malformed
+    `windows.trigger`, the condition at which long recordings are cut.
     """
     label = p.description.label
     stated = [label] if any(getattr(label, kind) for kind in SOURCES) else []

@@ -79,8 +79,8 @@ def find_files(root: Path, description: Description) -> list[str]:
     """
     if root.is_file():
         return [root.name]
-    aside = {FOLDER_FILE, description.windows.listing}
-    aside |= {source.listing for source in description.labels}
+    listings = (description.windows.listing, *(source.listing for source in description.labels))
+    aside = {FOLDER_FILE, *(Path(name).as_posix() for name in listings)}  # also ./labels.csv
     names = match_files(root, description.files) - match_files(root, description.exclude) - aside
     if not names:
         raise DataError(
