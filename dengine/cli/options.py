@@ -499,8 +499,8 @@ class DataChoice:
         ------
         DataError
             If the description cannot be read or proposed, or a stated key is unknown or its value
-            has the wrong type. If the source does not exist or is damaged; but if a description is
-            given, the source is not looked at.
+            has the wrong type. If the source does not exist or is damaged, or is a bundled set and
+            a key is stated; but if a description is given, the source is not looked at.
         SettingError
             If none is given or saved, and a stated `windows.trigger` (where a part begins) is
             malformed.

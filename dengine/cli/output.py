@@ -272,16 +272,17 @@ def format_value(name: str, value: Any) -> str:
     Parameters
     ----------
     name : str
-        The field's name. Its ending tells the unit, see `FORMATTERS`: `_s`, `_bytes`, `share` ...
+        The field's name. Its ending tells the unit (`FORMATTERS`): `_s` seconds, `_bytes` bytes,
+        `share` a share of 1, and so on.
     value : object
         A number, a text, a dataclass, or a mapping, list or tuple of these. None, NaN and "" give
         "-", a bool "yes" or "no". A dataclass gives its own `str`, or else its fields with their
         headings, of which those that are None or empty are left out. Of a mapping only the items
         that are not 0 are shown, each after its key, by which it is formatted; if there are none,
         the text is "none". Items are joined by commas; each of the three `prices` stands after its
-        title (`TUPLE_TITLES`); an empty list or tuple gives "". A number whose name has no known
-        ending has 4 significant digits, or is whole if it is a whole number, with commas between
-        thousands. Passwords of database URLs in a text are masked.
+        title (check, escape or false reject); an empty list or tuple gives "". A number whose name
+        has no known ending has 4 significant digits, or is whole if it is a whole number, with
+        commas between thousands. Passwords of database URLs in a text are masked.
 
     Raises
     ------

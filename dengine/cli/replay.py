@@ -252,14 +252,14 @@ def compare(
     """Replay the same streams through several methods.
 
     Methods are reducers, and baselines (published methods, for comparison), each with a name of its
-    own. A stream is a shuffle of the recordings. Each method plays it under one policy (the
-    settings of its decisions) or a grid of policies: give a setting either as one value (--alpha)
-    or as a list to try (--alphas); both are a usage error. --paper gives the lists of the paper,
-    each unless you give your own; beside it, one value of alpha, the lower bound or the interval is
-    a usage error. One table, with a row for each method and policy, shows what was decided and how
-    much of it was wrong, like that of `dengine replay`. umap-learn takes much longer than the
-    others. Ctrl-C (exit code 130), or an error in a replay (1), ends it and shows the replays that
-    were finished.
+    own. A stream is a shuffle of the recordings, or with --in-order their recorded order. Each
+    method plays it under one policy (the settings of its decisions) or a grid of policies: give a
+    setting either as one value (--alpha) or as a list to try (--alphas); both are a usage error.
+    --paper gives the lists of the paper, each unless you give your own; beside it, --alpha and
+    --lower-bound are usage errors. One table, with a row for each method and policy, shows what was
+    decided and how much of it was wrong, like that of `dengine replay`. umap-learn takes much
+    longer than the others. Ctrl-C (exit code 130), or an error in a replay (1), ends it and shows
+    the replays that were finished.
     """
     short_names = [short_name(name) for name in names]
     if len(set(short_names)) < len(short_names):
@@ -604,7 +604,8 @@ def _curve_lines(curve: CostCurve, dataset: Dataset) -> Iterator[str]:
     They say which policy was chosen, and how the choice depends on the three prices (of a check, a
     bad accepted part and a good rejected part). If there are any, they also say how many recordings
     of the data set equal an earlier one (by a hash of their samples), which policies were left
-    behind because they were dearer in the first shuffles, and which were not tried.
+    behind because they were dearer in the first shuffles (random orders of the parts), and which
+    were not tried.
     """
     from ..experiments.costs import policy_name
     from ..experiments.survey import survey_dataset
@@ -624,11 +625,12 @@ def _curve_lines(curve: CostCurve, dataset: Dataset) -> Iterator[str]:
 def _as_flags(settings: Options) -> str:
     """Return settings of a policy, given by name, as options of the command line in one text.
 
-    It is like "--alpha 0.1 --lower-bound 0.9", in the order of the settings; the prices are joined
-    by commas. Without settings it is "".
+    It is like "--alpha 0.1 --lower-bound 0.9", in the order of the settings; the prices (of a
+    check, a bad accepted part and a good rejected part) are joined by commas. Without settings it
+    is "".
     """
     texts = {
-        name: ",".join(f"{price:g}" for price in value) if name == "prices" else str(value)
+        name: ",".join(f"{price:.15g}" for price in value) if name == "prices" else str(value)
         for name, value in settings.items()
     }
     return " ".join(f"--{name.replace('_', '-')} {text}" for name, text in texts.items())
@@ -640,8 +642,9 @@ def _cost_cells(row: PolicyCost, is_chosen: bool) -> tuple[str, ...]:
     They are its rule ("> " stands before it if the policy is chosen), its LB in percent
     (`lower_bound` of the policy; "-" if its guarantee is cost), cost with its interval in a second
     line, late cost (over the last third of each shuffle), share of verified parts, and wrong
-    accepts and rejects with the intervals of their shares. The rule is like "alpha 0.1" if the
-    guarantee is local, else the name of the guarantee, which is the rule that decides.
+    accepts and rejects with the intervals of their shares. The guarantee is what is promised about
+    decisions, and the rule that keeps it; the cell of the rule is its name, or like "alpha 0.1" if
+    it is local (about the neighbourhood of each trace).
     """
     policy = row.policy
     rule = f"alpha {policy.alpha:g}" if policy.guarantee == "local" else policy.guarantee

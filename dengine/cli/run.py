@@ -290,8 +290,9 @@ def _robot_cell(source: DataChoice, host: str | None, **others: Any) -> CellToDr
 
     A `TraceSpec` says what shape, rate and unit traces have. The robot is a Universal Robots
     controller at `host`, HOST or HOST:PORT. The options of `source` say what is recorded, and when;
-    `others` are settings of other kinds of robot cell, and are ignored. Nothing is connected before
-    the function is called. The cell's `close` ends the connection.
+    `others` are settings of other kinds of robot cell, and are ignored. The function takes the
+    engine, and returns the cell and its name. Nothing is connected before it is called. The cell's
+    `close` ends the connection.
 
     Raises
     ------

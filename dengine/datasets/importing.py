@@ -142,8 +142,8 @@ def import_labelled(
     """Put every labelled trace of a data set into a store, in order; nothing is trained.
 
     The traces are stored in chunks, each in one transaction: if an import is interrupted, the same
-    call continues it. A trace that the store has from an earlier import is not stored again, but a
-    trace that a robot cell recorded itself is.
+    call continues it. Traces are recognised by their samples: as many equal traces as the store has
+    from earlier imports are not stored again; those that a robot cell recorded itself do not count.
 
     Parameters
     ----------
@@ -222,13 +222,14 @@ def import_parts(
 
     Each chunk is one transaction; if storing one raises StoreError, those before stay. If the store
     has a label for a decision, also one that was withdrawn, nothing is changed: the new label is
-    counted as repeated or, if it differs, as contradicted. A decision that it has without a label
-    stays as it is, too, and gets only the label. New rows have the time of the import. A trace with
-    a fault (like a NaN, or a value at the limit of the sensor) is stored but never used in
-    training, and its decision gets the fault as its reason. If `policy.stops` is "some" (a missing
-    report on an accepted part says nothing), each label also stores the number of accepted parts
-    without a report since the label before, or since the last change of the policy; the label of a
-    trace with a fault stores 0, and the next label counts these parts.
+    counted as repeated or, if it differs or the stored one was withdrawn, as contradicted. A
+    decision that it has without a label stays as it is, too, and gets only the label. New rows have
+    the time of the import. A trace with a fault (like a NaN, or a value at the limit of the sensor)
+    is stored but never used in training, and its decision gets the fault as its reason. If
+    `policy.stops` is "some" (a missing report on an accepted part says nothing), each label also
+    stores the number of accepted parts without a report since the label before, or since the last
+    change of the policy; the label of a trace with a fault stores 0, and the next label counts
+    these parts.
 
     Parameters
     ----------

@@ -61,6 +61,6 @@ def unit_in(name: str) -> str:
     `/` or `_` a single character is none, except N: `Fz_W` is a force in world axes.
     """
     match = re.search(
-        r"(?:[\[({<]|\bin |\.\.|[/_](?![^N]$))\s*([^\[\](){}<>/_ ]+?)\s*[\])}>_.]?$", name
+        r"(?:[\[({<]|\bin |\.\.|[/_](?![^N][_.]?$))\s*([^\[\](){}<>/_ ]+?)\s*[\])}>_.]?$", name
     )
     return match[1] if match and is_unit(match[1]) else ""

@@ -349,11 +349,12 @@ class MemberEvidence(nn.Module):
 
         If the decision rule knows all outcomes, the part counts as checked; otherwise
         `inclusion_probability`, with which its outcome would be asked for, says how: 1 as checked,
-        above 0 as audited (drawn at random), and 0 not at all. Each level that the score reaches
-        counts the part, and keeps whether it was wrong among its newest 50. The part is a member
-        (one of the parts that the rule's promise is about) if its score reaches the target, or if
-        `predicted`, the `ActionCode` of what the model alone would have done, is the action of this
-        side. No threshold is chosen if the part is counted nowhere.
+        above 0 as audited (drawn at random), which is counted apart, and 0 not at all. Each level
+        that the score reaches counts the part, and keeps whether it was wrong among its newest 50.
+        The counts of members (the parts that the rule's promise is about) get the part, too, if its
+        score reaches the target, or if `predicted`, the `ActionCode` of what the model alone would
+        have done, is the action of this side. No threshold is chosen if the part is counted
+        nowhere.
         """
         if score >= float(self.thresholds[side].item()):
             self.step_detector(side, self.error_steps[side] if wrong else self.correct_step, 1)

@@ -343,21 +343,22 @@ class Corrections:
     def set_policy(self, policy: Policy, author: str = "") -> Changed:
         """Decide by another policy from the next decision on.
 
-        The policy is stored. A trained model goes on under it as a new version; before the first
-        training no version is made. Earlier decisions keep their bounds. First the labels that wait
-        are stored, and what other cells of the product (robot cells that share labels and versions)
-        stored is taken in. A training under way in the executor is discarded, and begins again; one
-        that is done is put in force or dropped.
+        The policy is stored. A trained model goes on under it as a new version, with a new number;
+        before the first training no version is made. Earlier decisions keep their bounds. First the
+        labels that wait are stored, and what other cells of the product (robot cells that share
+        labels and versions) stored is taken in. A training under way in the executor is discarded,
+        and begins again; one that is done is put in force or dropped.
 
         The decision rule turns bounds into actions, and may learn from outcomes. It starts anew if
-        alpha, lower_bound, interval, guarantee, stops or prices change. Under the guarantees
-        "pooled" and "cost" with stops="some" it also starts anew if the audit rate (the share of
-        certain decisions, accepts and rejects, that are checked all the same) changes. A new rule
-        is updated only with decisions from now on, because a tolerance that was chosen after the
-        data was seen cannot be tested on that data, and old bounds have another scale.
-        `certificate`, which bounds the share of wrong decisions, counts those since the last change
-        of the policy, whatever changed. If somebody chooses the best of the certificates of m
-        policies, the error probability of that certificate is up to m alpha.
+        the policy's alpha, lower_bound, interval, guarantee, stops or prices change. Under the
+        guarantees "pooled" and "cost" with stops="some" it also starts anew if the audit rate (the
+        share of certain decisions, accepts and rejects, that are checked all the same) changes. A
+        new rule is updated only with decisions from now on, because a tolerance that was chosen
+        after the data was seen cannot be tested on that data, and old bounds have another scale.
+        `certificate`, which bounds the probabilities that an accept or a reject is wrong, counts
+        the decisions since the last change of the policy, whatever changed. If somebody chooses the
+        best of the certificates of m policies, the error probability of that certificate is up to
+        m alpha.
 
         A model that the user handed in keeps its own rule, whatever changes.
 

@@ -437,11 +437,12 @@ class DataEngine(AbstractContextManager["DataEngine"]):
             in one object) or policy all fields are compared, also those at their defaults. The
             shadow mode (every part is verified), missing force limits (an operator's limits of the
             signal) and arguments that are left out are not compared
-            (`EngineSettings.check_request`). A reducer that is an object, `model` and `trace` are
-            as for `open`; `executor`, `clock`, `replaying` and `on_safe_mode` are not stored, so
-            any may be given. A new cell of a product also takes the recipe of the first other cell,
-            unless it is given a recipe, reducer or model, or the other cell was given an object as
-            reducer or model.
+            (`EngineSettings.check_request`). As for `open`, a reducer that is an object and `model`
+            must be the same object again, and `trace` may add a rate, units or columns that were
+            unknown. How the engine runs (`executor`, `clock`, `replaying`, `on_safe_mode`) is not
+            stored, so any may be given. A new cell of a product also takes the recipe of the first
+            other cell, unless it is given a recipe, reducer or model, or the other cell was given
+            an object as reducer or model.
 
         Returns
         -------

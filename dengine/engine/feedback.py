@@ -197,9 +197,10 @@ class Feedback:
         `stored` is the decision with the label that it has so far. If a report or the next decision
         had confirmed an accepted part as good (CONFIRMED), the report that it was bad and stopped
         the line is recorded but not learned yet, and `remedy`, which says what must be done later,
-        is set to CORRECT. It is set to REBUILD_RULE, unless it is set already, if the decision rule
-        had counted the part's check as overdue, and so as wrong. Raises ReportError for any other
-        report on a decision with a label; then nothing is changed.
+        is set to CORRECT: apply the correction, and rebuild the decision rule. It is set to
+        REBUILD_RULE, unless it is set already, if the rule had counted the part's check as overdue
+        (not reported in time), and so as wrong. Raises ReportError for any other report on a
+        decision with a label; then nothing is changed.
         """
         decision = stored.decision
         source = source_of(decision, success)

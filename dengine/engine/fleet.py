@@ -91,11 +91,12 @@ class Peers:
         The training window holds the newest labelled traces, and the cells are those of the product
         (robot cells that share labels and versions). If more labels came than the window holds,
         only the newest are read. They are read with the corrections (later changes of labels) up to
-        `LiveModel.corrected_to`; a full window loses its oldest label. Labels of traces with a
-        fault, like a NaN, and forgotten (withdrawn) labels are left out, and so are labels of
-        damaged traces, for which an event (a row in the store's log) is recorded. There is no time
-        limit. Raises StoreError, and adds nothing, if the store cannot be read, the traces have
-        different shapes, or a label is neither 0 nor 1.
+        `LiveModel.corrected_to`, the newest that the model has; a full window loses its oldest
+        label. Labels of traces with a fault, like a NaN, and forgotten (withdrawn) labels are left
+        out, and so are labels of damaged traces (missing, or not as they were stored), for which an
+        event (a row in the store's log) is recorded. There is no time limit. Raises StoreError, and
+        adds nothing, if the store cannot be read, the traces have different shapes, or a label is
+        neither 0 nor 1.
         """
         labelled = self._outbox.store.labels.with_traces(
             self._window.capacity,

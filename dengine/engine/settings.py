@@ -232,8 +232,8 @@ class EngineSettings:
         unknown name is an error, too; so are `model` and the names of `RunOptions` (executor,
         replaying, clock, on_safe_mode), which the caller must take out before. If the user handed
         in a model, which decides by its own rule, only settings that have an effect on any model
-        are compared (`LOOP_SETTINGS`: seed, trace, retrain_every, budget, max_steps, window,
-        audit_rate, stops, label_within and force_limits).
+        are compared (`LOOP_SETTINGS`): seed, trace, audit_rate, stops, label_within, force_limits
+        and those of a retrain (retrain_every, budget, max_steps and window).
 
         Not compared are the shadow mode (every part is verified), and force limits (an operator's
         limits of the force) that the program leaves out, because an operator sets both while the

@@ -281,8 +281,9 @@ class AgreeingNeighbours(Baseline):
     def _predict(self, X: TraceArray) -> BaselinePrediction:
         """Return the share of successes among the k nearest labelled traces as both bounds.
 
-        The counts are the numbers of successes and failures among the k. Of traces at the same
-        distance any may be taken. X has shape (n, C, T), and all four arrays (n,).
+        The bounds are those of the success probability, the counts the numbers of successes and
+        failures among the k. Of traces at the same distance any may be taken. X has shape (n, C,
+        T), and all four arrays (n,).
         """
         distances = self._references.squared_distances(_rows(X))
         nearest = np.argpartition(distances, self.k - 1, axis=1)[:, : self.k]

@@ -297,17 +297,18 @@ def window_curves(replays: Sequence[Replay], window: int = WINDOW, fewest: int =
 def curves(by_recipe: Mapping[str, Sequence[Replay]], title: str = "") -> Figure:
     """Draw the paper's curves over a sliding window of cycles, in a colour for each key.
 
-    A key is a recipe with its replays, or a live run. Up to six keys have the colours in `RECIPES`.
-    More keys have 20 others, which the 21st key and those after it use again.
+    A key is a recipe (all settings of an engine) with its replays, or a live run. Up to six keys
+    have the colours in `RECIPES`. More keys have 20 others, which the 21st key and those after it
+    use again.
 
-    The panels show, from the top: the share of certain decisions, those without a check, and its
-    spread over the replays; the share of good parts among the accepted parts, and the lower bound
-    LB of each policy (the success probability that accepted parts must have); bad parts among the
-    accepted parts (solid), good parts among the rejected parts (dashed), and the tolerances 100 -
-    LB, all in percent. The legend below has the counts of wrong decisions. A part of unknown truth
-    counts as rightly decided. Shares of fewer than 20 accepted or rejected parts are not drawn; the
-    share of certain decisions is drawn from the first cycle. The window is 300 cycles, or a third
-    of the longest replay if that is less.
+    The panels show, from the top: the share of certain decisions, those without a check, with its
+    10th to 90th percentile over the replays; the share of good parts among the accepted parts, and
+    the lower bound LB of each policy (the success probability that accepted parts must have); bad
+    parts among the accepted parts (solid), good parts among the rejected parts (dashed), and the
+    tolerated shares, 100 - LB, all in percent. The legend below has the counts of wrong decisions.
+    A part of unknown truth counts as rightly decided. Shares of fewer than 20 accepted or rejected
+    parts are not drawn; the share of certain decisions is drawn from the first cycle. The window is
+    300 cycles, or a third of the longest replay if that is less.
 
     Parameters
     ----------

@@ -232,8 +232,8 @@ def load_contenders(recipes: Sequence[Any]) -> list[Contender]:
     Raises
     ------
     SettingError
-        One of them cannot be loaded, or two have the same name and policy, so that no table could
-        tell them apart.
+        One of them cannot be loaded, or two have the same name and policy (settings of decisions),
+        so that no table could tell them apart.
     """
     recipes = [recipes] if isinstance(recipes, str) else recipes
     contenders = [Contender.load(recipe) for recipe in recipes]

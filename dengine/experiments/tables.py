@@ -158,10 +158,12 @@ def promise_lines(rows: Sequence[Row]) -> list[str]:
 def pooled_table(rows: Sequence[Row], title: str, legend: str) -> Table:
     """Return the rows that `pool` returned as a rich Table for the screen, with a legend below.
 
-    There must be at least one row. The first column has the recipe, the guarantee, the policy's
-    `stops`, and the interval if the rows differ in it. The others are those of `CELLS`: alpha and
-    lower bound, counts and shares of decisions and errors, times of retrains and decisions, and
-    seconds of checks saved.
+    There must be at least one row. The first column has the recipe (all settings of an engine), the
+    guarantee (the rule that decided), the policy's `stops` (which bad accepted parts stop the
+    line), and the interval if the rows differ in it. The others are those of `CELLS`: alpha (the
+    error level) and lower bound (the success probability that accepted parts must have), counts and
+    shares of decisions and errors, times of retrains and decisions, and the seconds of checks
+    saved, alone and less the cost of errors.
     """
     several_intervals = len({row["interval"] for row in rows}) > 1
     shown = []

@@ -301,12 +301,13 @@ class DecisionModule(nn.Module):
         number (of the content of its trace, if it has none) gives the part's fold k, one of K
         permanent groups, and the reference is put into embedding space k, which was trained without
         the labels of fold k. If there is no room, the oldest reference is dropped. The rule gets
-        the bound, the label, what the model alone would have done, and the probability with which
-        the outcome would be asked for: the audit rate if the part was audited (checked at random
-        although the model was certain), 1 if it was verified for another reason, and 0 if it was
-        accepted or rejected. It also gets whether the trace was novel (unlike all training traces),
-        and `n_unreported`, the number of accepted parts without a report since the last label,
-        which restarts at 0. `pending` is not changed.
+        the bounds of the success probability, the label, what the model alone would have done, and
+        the probability with which the outcome would be asked for: the audit rate if the part was
+        audited (checked at random although the model was certain), 1 if it was verified for another
+        reason, and 0 if it was accepted or rejected. It also gets whether the trace was novel
+        (unlike all training traces), and `n_unreported`, the number of accepted parts without a
+        report since the last label, which restarts at 0. `pending` (the last decision, while its
+        outcome is not known) is not changed.
         """
         inclusion_probability = 0.0
         if decided.action == ActionCode.VERIFY.value:

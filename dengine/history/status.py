@@ -676,10 +676,10 @@ def read_course(store: SqlStore, **by: float) -> Course:
     ----------
     store : SqlStore
     **by
-        `seconds` and `start`, for stretches that are periods of time (`DecisionTable.stretches`);
-        only the newest 120 with decisions are returned. Without them all decisions of the robot
-        cell are split into at most 120 stretches of equal number, at least 20 each; the newest may
-        have fewer.
+        For stretches that are periods of time: their length `seconds`, and `start`, a time in
+        seconds since 1970 at which one begins (there may be earlier ones); only the newest 120 with
+        decisions are returned. Without them all decisions of the robot cell are split into at most
+        120 stretches of equal number, at least 20 each; the newest may have fewer.
 
     Returns
     -------

@@ -142,12 +142,13 @@ class Predictor(nn.Module):
         `part` is the hash of the part that the trace is of; references (labelled points) of this
         part are not counted, and 0 excludes none. Returns the positions of action and reason in
         `ACTIONS` and `REASONS`, the bounds lower and upper of the success probability, the counts
-        n_success and n_failure of the labels within the radius, and the embedding (K, d), a point
-        in each of K spaces, divided by the scale (unit of length) of the space. Several labels of
-        one part may count as fewer. If the decision rule uses the bounds only to sort parts, and
-        the reducer gives a probability of success (`RadiusNeighbours.scored`), both bounds are the
-        mean of this probability over the K spaces; for a rule with `prior_labels` it is drawn
-        towards 1/2 while few references are known. A novel trace, unlike all training traces, is
+        n_success and n_failure of the labels within the radius (a fixed distance in the embedding),
+        and the embedding (K, d), a point in each of K spaces, divided by the scale (unit of length)
+        of the space. Several labels of one part may count as fewer. If the decision rule uses the
+        bounds only to sort parts, and the reducer gives a probability of success
+        (`RadiusNeighbours.scored`), both bounds are the mean of this probability over the K spaces,
+        drawn towards 1/2 while few references are known: with n references its logit is multiplied
+        by n / (n + the rule's `prior_labels`). A novel trace, unlike all training traces, is
         verified (sent to the slow check) without counting: its bounds are 0 and 1, its counts are
         0.
         """
@@ -246,7 +247,7 @@ def compiled(eager: Decider, warm_up_shape: tuple[int, ...]) -> Any:
     copy of the template, a compiled decider that the process keeps for all deciders with the same
     classes, attributes and shapes of tensors (`structure_of`). If the process has no such template,
     `template_of` compiles it, and calls it on a trace of `warm_up_shape` (C, T). Raises what
-    `template_of` raises.
+    `template_of` raises, if TorchScript cannot compile or run the decider.
     """
     module = copy.deepcopy(template_of(eager, warm_up_shape))
     submodules = dict(module.named_modules(remove_duplicate=False))
@@ -937,13 +938,14 @@ class ModelPrediction(EngineModel):
         embedding space), decision rule (in place) and novelty gate (which notices traces unlike
         those of the training) are restored, and the reducer if the state holds it. If it does not
         (`needs_refit`), train this model on the same traces before this call. The module that
-        decides is dropped and built anew when it is used; `examples` stay. If the classifier's
-        `capacity` is smaller than the number of references, the newest are kept. If the state has
-        no arrays of a rule, because the rule was stale (an update of it had failed) or has no
-        tensors, this model's rule stays as it is; `rule_is_stale` always stays as it is. Raises
-        StoreError if the state holds no reducer although this fitted reducer gives a state, and for
-        a rule or gate of other sizes. For the state of another reducer it raises StoreError,
-        KeyError, ValueError or NotImplementedError. After an error do not use the model.
+        decides is dropped and built anew when it is used; `examples` (some of the training traces)
+        stay. If the classifier's `capacity` is smaller than the number of references, the newest
+        are kept. If the state has no arrays of a rule, because the rule was stale (an update of it
+        had failed) or has no tensors, this model's rule stays as it is; `rule_is_stale` always
+        stays as it is. Raises StoreError if the state holds no reducer although this fitted reducer
+        gives a state, and for a rule or gate of other sizes. For the state of another reducer it
+        raises StoreError, KeyError, ValueError or NotImplementedError. After an error do not use
+        the model.
         """
         if not self.needs_refit(state):
             self.spaces.set_state(arrays_with_prefix(state, "reducer."))

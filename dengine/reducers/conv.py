@@ -265,9 +265,9 @@ class ConvReducer(TorchReducer):
         There is a space for each of the K folds (fixed groups of traces); the models of space k
         were trained without the labels of fold k. The first of the d coordinates is a probability
         of success; its logit is the mean of the logits of the network and of `rocket_`, the
-        `RocketReducer` beside it. The second coordinate, if any, is the network's. Raises
-        NotFittedError before there are networks, and the errors of `check_traces`, such as
-        ValueError for traces of another shape.
+        `RocketReducer` beside it. The second coordinate, if any, is the network's: 0.1 times the
+        difference of its two sigmoid units. Raises NotFittedError before there are networks, and
+        the errors of `check_traces`, such as ValueError for traces of another shape.
         """
         traces = self.check_traces(X)  # once, since `rocket_` knows no names of columns
         return average_logits(

@@ -676,10 +676,11 @@ class RocketReducer(ProbabilityReducer):
         """Raise SettingError for a parameter out of its range.
 
         `kernels`, `dilations`, `width` (the most principal components that are kept of the
-        features) and `max_iter` must be integers from 1 to a billion, `regions` from 1 to 16,
-        `groups` (of kernels that compete with each other) from 0 to 64, `n_components` 1 or 2, and
-        `folds` from 2 to 1000; booleans and floats are refused. `l2` must be above 0; TypeError is
-        raised if it cannot be compared with 0. `random_state` is not checked.
+        features) and `max_iter` must be integers from 1 to a billion, `regions` (stretches of the
+        trace, over each of which a kernel is averaged) from 1 to 16, `groups` (of kernels that
+        compete with each other) from 0 to 64, `n_components` 1 or 2, and `folds` from 2 to 1000;
+        booleans and floats are refused. `l2` must be above 0; TypeError is raised if it cannot be
+        compared with 0. `random_state` is not checked.
         """
         check_integers(
             self,

@@ -237,11 +237,11 @@ class RocketEncoder(nn.Module):
         """Compute the features of tower 1, ramps of kernels: (B, D * F * R).
 
         Tower 1 is the first of two groups of features. `windows` (D, C * 9, P * B) are the inputs
-        from `batch` = B traces, see `as_windows`, of F kernels at each of D dilations and P places.
-        R regions divide the trace. The output of a kernel at a place goes through a ramp, which
-        rises from 0 to 1 around the kernel's threshold and is flat beyond. A feature is the mean of
-        the ramp over a region, plus twice its mean over the whole trace. In the order of the
-        features, dilations vary slowest and regions fastest.
+        of F kernels, 9 in each of C channels, at each of D dilations and P places of `batch` = B
+        traces (see `as_windows`). R regions divide the trace. The output of a kernel at a place
+        goes through a ramp, which rises from 0 to 1 around the kernel's threshold and is flat
+        beyond. A feature is the mean of the ramp over a region, plus twice its mean over the whole
+        trace. In the order of the features, dilations vary slowest and regions fastest.
         """
         h = torch.baddbmm(self.threshold, self.kernel, windows).clamp_(0.0, 1.0)  # (D, F, P * B)
         if batch == 1:  # one product whose columns are the regions takes four times as long

@@ -307,7 +307,7 @@ class Guard:
         only read, on a request that may change something (a method other than GET, HEAD and
         OPTIONS). A request for /healthz without a right token is allowed, and `CURRENT_TOKEN` is
         then not set. A server without tokens allows every request, with the token `ANYBODY`. A
-        secret in the path is removed from `scope`, the ASGI scope of the request.
+        secret in the path (/RPC2/SECRET) is removed from `scope`, the ASGI scope of the request.
         """
         secret = take_token(scope, headers.get("authorization", ""))
         token = find_token(self.tokens, secret) if self.tokens else ANYBODY

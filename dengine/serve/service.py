@@ -66,8 +66,9 @@ class Job(NamedTuple):
     def run(self, engine: DataEngine) -> None:
         """Do the work with the engine, and set the future's result or exception.
 
-        If the future was cancelled, because its caller timed out or was cancelled, the work is done
-        all the same; its result is dropped, and an exception is logged. Nothing is raised.
+        If the future was cancelled, because its caller timed out or was cancelled, the work is told
+        so, and done all the same (a decision is then VERIFY, without asking the model); its result
+        is dropped, and an exception is logged. Nothing is raised.
         """
         has_caller = self.future.set_running_or_notify_cancel()
         try:

@@ -45,7 +45,7 @@ class DecisionTable(CellTable):
         StoredDecision or None
             None for an unknown id, also for the id of another cell's decision. If the part was
             confirmed as good without a check, and its label was corrected to bad, the label's
-            source is `Source.STOP`.
+            source is `Source.STOP`, as if the part had stopped the line.
 
         Raises
         ------
@@ -95,8 +95,8 @@ class DecisionTable(CellTable):
         ----------
         where : HistoryFilter
             The selection: a decision must have the values of all fields that are not None (action,
-            predicted action, reason, label, part), and its time must lie from `since` to before
-            `until`.
+            what the model alone would have done, reason, label, part), and its time must lie from
+            `since` to before `until`.
         limit : int
             Number of decisions at most.
         start_after : str or None
@@ -349,8 +349,8 @@ class DecisionTable(CellTable):
         list of Stretch
             Sorted by their newest decision; [] without decisions. Each has the number of decisions,
             the time of the newest, and how many of them are verified, verified because the trace is
-            novel, accepted, accepted but bad by the label after corrections, rejected by the model,
-            and decided by an operator's limits.
+            novel (unlike those of the training), accepted, accepted but bad by the label after
+            corrections, rejected by the model, and decided by an operator's limits.
         """
         if seconds:
             stretch: sa.ColumnElement[Any] = sa.func.floor((DECISION.c.time - start) / seconds)

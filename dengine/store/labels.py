@@ -89,8 +89,8 @@ class LabelTable(CellTable):
         first, last : int, optional
             Numbers of the first and the last label, both included.
         corrected_to : int or None
-            Only corrections (changes of labels) up to this number are applied, so that labels are
-            as they stood then. None: all.
+            Only corrections (changes of labels) whose own number is at most this one are applied,
+            so that labels are as they stood then. None: all.
         cell_only : bool, default False
             Leave out the labels of the product's other robot cells.
 
@@ -98,7 +98,8 @@ class LabelTable(CellTable):
         -------
         LabelledTraces
             Numbers of the labels, traces, labels (1 or 0) and content hashes (64-bit hashes of the
-            traces or of their parts' numbers), as arrays; empty if there are none.
+            parts' numbers, or of the traces of parts without one), as arrays; empty if there are
+            none.
 
         Raises
         ------

@@ -79,8 +79,9 @@ class DecisionIndex:
         `entry` holds the record. The newest N_RECENT decisions (1,000) stay in memory, in `recent`.
         If the record is a label, and its decision is there, that is replaced by a copy with the
         label, without the label's number and time; a later label of the decision is not removed. An
-        event changes nothing, nor does a decision if another with the same id was added after it.
-        Raise KeyError for a label if no label of its decision waits for the database.
+        event (a row of the store's log) changes nothing, nor does a decision if another with the
+        same id was added after it. Raise KeyError for a label if no label of its decision waits for
+        the database.
         """
         record = entry.record
         if isinstance(record, StoredDecision) and not self.is_replaced(entry):

@@ -67,9 +67,9 @@ class MemoryStore(Outbox):
             self.store.apply_records(part)
 
     def record_decision(self, item: StoredDecision) -> StoredDecision:
-        """Keep a copy of a decision with the cell's next number in memory, and return it.
+        """Keep a copy of a decision with the robot cell's next number in memory, and return it.
 
-        It is written to the database when somebody uses the store. That its id is new is not
+        It reaches the database before that is next read or written. That its id is new is not
         checked.
         """
         self.n_decisions += 1

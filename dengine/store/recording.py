@@ -96,8 +96,8 @@ class Recorder:
         """Why the journal cannot be written: the last error, or that a sync takes too long.
 
         The journal is the log on the local disk that gets each record first. A sync takes too long
-        if it lasts longer than `limit` seconds, an argument of `Recorder`. "" if the journal can be
-        written.
+        if it has not ended after `limit` seconds, an argument of `Recorder`. "" if the journal can
+        be written.
         """
         seconds = time.monotonic() - self._began
         if self._error or seconds <= self._limit:

@@ -317,8 +317,9 @@ def overdue_outcomes(decision: Decision) -> list[OutcomeRecord]:
     0 as the lower bound, and the decision's upper one; its `predicted` is REJECT if the model alone
     would have rejected the part. Otherwise `predicted` is VERIFY. It is given as an `ActionCode`: 0
     VERIFY, 1 ACCEPT, 2 REJECT. So there are none, one or two outcomes. All have label number 0
-    (`seq`), are not novel, count no unreported accepted parts (`silent` 0), and have the inclusion
-    probability of the decision, with which a check was asked for.
+    (`seq`), are not novel (unlike all training traces), count no unreported accepted parts
+    (`silent` 0), and have the inclusion probability of the decision, with which a check was asked
+    for.
     """
     probability = decision.inclusion_probability
     outcomes = []

@@ -282,12 +282,13 @@ def propose_tables(p: Proposal, files: Tables) -> None:
     `part.column` is looked for all the same, unless it is stated. `files` has the table of each
     file that is looked at. At most the first 50,000 rows of each are used; `p.is_cut` is set if a
     file has more. `p.tables` becomes the tables of the first 240 parts without damage, with only
-    the rows that are samples, `p.columns` their columns, and `p.names` is emptied unless each file
-    is one part. If the layout or `part.column` is `?` (the user must answer), nothing more is
-    proposed: `p.tables` and `p.names` stay, and a note on `channels` says why. Raises DataError if
-    there is no part without damage, if the tables do not split as a stated layout says, if a stated
-    column or setting in `[time]` is wrong, or if no recording has a label at the stated place, and
-    SettingError for a malformed `windows.trigger`, the condition at which long recordings are cut.
+    the rows that are samples, `p.columns` their columns, and `p.names` (the files of recordings) is
+    emptied unless each file is one part. If the layout or `part.column` is `?` (the user must
+    answer), nothing more is proposed: `p.tables` and `p.names` stay, and a note on `channels` says
+    why. Raises DataError if there is no part without damage, if the tables do not split as a stated
+    layout says, if a stated column or setting in `[time]` is wrong, or if no recording has a label
+    at the stated place, and SettingError for a malformed `windows.trigger`, the condition at which
+    long recordings are cut.
     """
     p.is_cut |= any(len(table.lines) > MOST_ROWS for table in files)
     files = [table.take(slice(MOST_ROWS)) for table in files]

@@ -104,7 +104,8 @@ def is_clock(column: Column) -> bool:
     for a column that is named like a clock (`time`, `stamp`, `t`, ...), if not all its cells are
     numbers and they change within a recording, or if all are numbers that rise and it has no unit
     of another quantity, like N. Numbers count as rising if they fall in at most 10 % of the steps,
-    like a counter that begins again, or in at least 90 %, if the newest row is the first.
+    like a counter that begins again, or in at least 90 %, if the newest row is the first. Raises
+    UnreadableError if cells are lists.
     """
     is_named = NAME.search(column.name)
     if column.forms or (is_named and column.odd):

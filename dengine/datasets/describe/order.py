@@ -82,9 +82,10 @@ def _last(path: str) -> str:
 def counts_parts(names: Sequence[str]) -> bool:
     """Return whether sorted names prove an order, by what they differ in first.
 
-    That must be a number, and a different one in each name, or a part of a date or time behind the
-    year, without AM and PM. Numbers that repeat may be of a program or a station, and words sort
-    before numbers. Equal names prove it, too.
+    The order is that in which the parts were made. What differs must be a number in every name, and
+    either another one in each, or a year or a part of a date or time behind it. Different names
+    with AM or PM prove nothing. Numbers that repeat may be of a program or a station, and words
+    sort before numbers. Equal names prove it, too.
     """
     pieces = [*zip_longest(*map(natural_key, names), fillvalue="")]
     for i, row in enumerate(pieces):

@@ -188,13 +188,15 @@ def sources_named(p: Proposal, column: re.Pattern[str], line: re.Pattern[str]) -
 def propose_part(p: Proposal) -> None:
     """Set `[part]` in `p` to the column or the line above the header that has the part's number.
 
-    Its name must be like that of a part's number, and it must have more different words than half
-    the number of `p.tables`. Recordings in which it is missing, empty or changes give no word.
-    Columns that have a role are left out, and the lines are those of the first table. If several
-    qualify, nothing is set. If none does, but in a table with a row for each part such a column has
-    several words, at most half as many as rows, and `[rows]` is empty, `part.column` is `?`, with a
-    note: the rows may be pieces of a curve. A `[part]` that is set already stays. Raises
-    SettingError for a malformed `windows.trigger`.
+    `p` holds the description so far, and a table of each recording. The name must be like that of a
+    part's number, and there must be more different words than half the number of `p.tables`.
+    Recordings in which the word is missing, empty or changes give none. Columns that the
+    description uses already, for example as the clock, are left out, and the lines are those of the
+    first table. If several qualify, nothing is set. If none does, but in a table with a row for
+    each part such a column or line has several words, at most half as many as rows, and `[rows]`,
+    which says what rows are kept, is empty, `part.column` is `?`, with a note: the rows may be
+    pieces of a curve. A `[part]` that is set already stays. Raises SettingError for a malformed
+    `windows.trigger`.
     """
     about = p.description
     counts = {
@@ -293,16 +295,18 @@ def may_be_channel(column: Column) -> bool:
 def find_lost(p: Proposal) -> None:
     """Set `text.missing` in `p` to the words that stand for lost samples (cells without a value).
 
-    They are those already there, and those of `LOST`, like `nan`, `-` or the empty cell, that a
-    channel has, in any case of letters. If another text is in more than 1 % of a channel's cells,
-    or if a cell of a text file has a number like -9999 or 1e30, `text.missing` is `?`, with a note.
-    If more than 10 % of the cells of a channel are empty, "" is not added for it if `time.column`
-    is set, even to `?`: these rows belong to another signal. `[rows]` then drops them, unless it
-    has words of this channel already. `[rows]` also gets each column without a role that changes
-    within a recording and has numbers and, in up to 10 % of its cells, other words, not all in
-    `LOST`, like `Max` in a footer; its `keep` is `?`, with a note. Dropped rows are left out of
-    `p.tables` and `p.columns` (see `set_rows`). A stated `text.missing` stays, but `[rows]` changes
-    all the same. Raises SettingError for a malformed `windows.trigger`.
+    `p` is the description so far. The words are those already there, and those of `LOST`, like
+    `nan`, `-` or the empty cell, that a channel has, in any case of letters. If another text is in
+    more than 1 % of a channel's cells, or if a cell of a text file has a number like -9999 or 1e30,
+    `text.missing` is `?`, with a note. If more than 10 % of the cells of a channel are empty, "" is
+    not added for it if `time.column` is set, even to `?`: these rows belong to another signal.
+    `[rows]`, the section on which rows are samples, then drops them, unless it has words of this
+    channel already. `[rows]` also gets each column without a role (like clock or channel) that
+    changes within a recording and has numbers and, in up to 10 % of its cells, other words, not all
+    in `LOST`, like `Max` in a footer; its `keep` is `?`, with a note. Dropped rows are left out of
+    `p.tables` and `p.columns`, but none while a `keep` is `?` (see `set_rows`). A stated
+    `text.missing` stays, but `[rows]` changes all the same. Raises SettingError for a malformed
+    `windows.trigger`.
     """
     rows = dict(p.description.rows)
     for column in p.unused:

@@ -137,10 +137,10 @@ def samples_of(table: Table, column: str, channel: Channel, form: TextForm) -> F
 
     The cells of `column` are in the unit that the file states for it, or else in the unit in its
     name, or else in the channel's unit. `form` says how numbers are written, and which words stand
-    for a lost sample, which is NaN. Raises UnreadableError if the file and the channel state
-    different units, and these are of different quantities or one is unknown; if the column is
-    missing; or if a cell is no number, is infinite or is too large for float32. A unit of another
-    quantity in the name is ignored.
+    for a lost sample, which is NaN. Raises UnreadableError if the file and the channel state units
+    that cannot be converted (an empty unit fits any); if the column is missing; or if a cell is no
+    number, is infinite or is too large for float32. A unit of another quantity in the name is
+    ignored.
     """
     values = table.numbers(column, form)
     unit = table.units.get(column)
@@ -283,14 +283,14 @@ def files_of(
 def parts_of(file: str | Table, description: Description, base: Path) -> Iterator[Table]:
     """Yield the tables of the parts in a file, or in a table that was read already.
 
-    The description says how files are read. Each table that `split` yields is one part, or, if the
-    section `[windows]` is stated, a long recording that is cut into parts. One that the section
-    `[rows]` drops by the word of a single cell is left out (`is_dropped`). `base` is the folder of
-    the file, and of the listing in `[windows]`, a file with the parts' starts and ends. Raises
-    UnreadableError or DataError if the file cannot be read, DataError if it cannot be split, or one
-    of its recordings cannot be cut (those before it are yielded), SettingError if
-    `windows.trigger`, the condition at which a part begins, is malformed, and LookupError for an
-    encoding that Python does not know.
+    The description says how files are read. Each table into which `split` divides the file is one
+    part, or, if the section `[windows]` is stated, a long recording that is cut into parts. It is
+    left out if a column that the section `[rows]` names has a single cell in it, with a word to
+    drop (`is_dropped`). `base` is the folder of the file, and of the listing in `[windows]`, a file
+    with the parts' starts and ends. Raises UnreadableError or DataError if the file cannot be read,
+    DataError if it cannot be split, or one of its recordings cannot be cut (those before it are
+    yielded), SettingError if `windows.trigger`, the condition at which a part begins, is malformed,
+    and LookupError for an encoding that Python does not know.
     """
     if not isinstance(file, Table):
         file = table_of(read_file(base / file), file, description)

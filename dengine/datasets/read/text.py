@@ -172,7 +172,7 @@ def _names(top: Sequence[str], header: int, form: TextForm) -> list[str]:
 def _read_plain(
     content: bytes, table: Table, form: TextForm, words: Container[str] | None
 ) -> Table | None:
-    """Return the table with its columns, read by pandas; None if the file is not plain.
+    """Return a copy of the table with its columns, read by pandas; None if the file is not plain.
 
     A file is not plain if a row has a wrong number of cells, a line or a last cell is empty, a cell
     has a line break, or `form.drop` (how lines begin that are left out) is not empty, even if no
