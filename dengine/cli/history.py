@@ -245,16 +245,17 @@ def explain(store: str, decision: str, neighbours: int, out: Out | None) -> None
     """Explain why a decision came out as it did.
 
     The decision is named by its id, as `dengine history STORE` lists it, by its part's number, or
-    by the word last, for the newest. If a part has several decisions that are no rejects, or
-    several rejects and nothing else, its number is refused with exit code 1; the message has their
-    ids. Only the newest 20 decisions on the part are looked at. A decision that is not in the store
-    is refused, too, and so is one whose trace is damaged, or the trace of one of its neighbours,
-    the labelled traces nearest to it. The counts of labels nearby, the bound (the interval of the
-    success probability) and the action are shown as they were recorded. Neighbours are searched
-    again with the version (the trained model) that decided, if the store still has it. The picture
-    of --out shows the trace with its neighbours and with the band that holds the middle 95 % of the
-    known good traces. Damaged labels, and damaged traces of this band, are left out, and an event
-    in the store's log records this.
+    by the word last, for the newest. If a part has several decisions that are no rejects (a reject
+    sorts the part out without a check), or several rejects and nothing else, its number is refused
+    with exit code 1; the message has their ids. Only the newest 20 decisions on the part are looked
+    at. A decision that is not in the store is refused, too, and so is one whose trace is damaged,
+    or the trace of one of its neighbours, the labelled traces of other parts nearest to it. The
+    counts of labels nearby, the bound (the interval of the success probability) and the action are
+    shown as they were recorded. Neighbours are searched again with the version (the trained model)
+    that decided, if the store still has it. The picture of --out shows the trace with its
+    neighbours and with the band that holds the middle 95 % of the known good traces. Damaged
+    labels, and damaged traces of this band, are left out, and an event in the store's log records
+    this.
     """
     from ..errors import ReportError
     from ..experiments.figures import explained_picture

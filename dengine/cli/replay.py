@@ -423,7 +423,8 @@ def _row_name(replay: Replay, frame: pd.DataFrame) -> str:
 
     It has the name of what was played (a recipe, the settings of an engine, or a baseline, a
     published method), and those settings of the policy that vary in `frame`, the table of all
-    replays: guarantee, stops, interval, alpha and lower bound (LB).
+    replays: guarantee, stops (whether every bad accepted part is reported), interval, alpha and
+    lower bound (LB).
     """
     policy = replay.recipe.policy
     settings = {

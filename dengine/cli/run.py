@@ -93,13 +93,14 @@ def run(
     handshake; --trigger says when its traces begin, and --samples how long they are.
 
     If too many decisions are wrong, or too many traces are unlike all known ones, the engine enters
-    safe mode: parts are verified until new outcomes allow decisions again. There is no safe mode
-    under --guarantee local with --stops some, the default. --shadow (verify every part) stays in
-    force in the store, until `dengine policy STORE --shadow off`. At the end a table shows what was
-    decided, what was wrong and what was saved. Ctrl-C or SIGTERM ends the run after the current
-    cycle, and a second Ctrl-C at once; what was done is shown, and the exit code is 130. A second
-    SIGTERM ends the process, and nothing is shown. If the cell fails, what was done is shown, too,
-    and the exit code is 1.
+    safe mode: parts are verified until new outcomes allow decisions again. There is no safe mode by
+    default, under --guarantee local (a part is judged by its neighbourhood alone) with --stops some
+    (bad accepted parts may stay unreported). --shadow (verify every part) stays in force in the
+    store, until `dengine policy STORE --shadow off`. At the end a table shows what was decided,
+    what was wrong and what was saved. Ctrl-C or SIGTERM ends the run after the current cycle, and a
+    second Ctrl-C at once; what was done is shown, and the exit code is 130. A second SIGTERM ends
+    the process, and nothing is shown. If the cell fails, what was done is shown, too, and the exit
+    code is 1.
     """
     if kind == "simulated":
         options.require_modules("the simulated cell", "sim", "mujoco")

@@ -479,15 +479,16 @@ class MemberEvidence(nn.Module):
     def members_to_recovery(self, side: int) -> float:
         """Return how many more members one side needs until it shows recovery from an alarm.
 
-        `side` is 0 for accepting, 1 for rejecting. Members are the parts whose score reached the
-        threshold that the side tested at the time. The number supposes that their outcomes go on as
-        they were since the alarm. It is 0 or less if they show recovery now, so that the side may
-        open again. It is huge, of the order of 1e12, while their evidence is not enough and not
-        above 0. The evidence is the log capital of a bet that the share of wrong members is below
-        the tolerance; under the priced rule it is what was saved minus what errors cost, and at
-        least 25 members since the alarm (`FEWEST_SINCE_ALARM`) are needed; under the watched rule
-        (the paper's, with a safe mode) it is the log likelihood ratio of the tolerance to its
-        double. Nothing is changed.
+        `side` is 0 for accepting, 1 for rejecting. An alarm says that too many parts were wrong, or
+        novel. Members are the parts whose score reached the threshold that the side tested at the
+        time. The number supposes that their outcomes go on as they were since the alarm. It is 0 or
+        less if they show recovery now, so that the side may open again. It is huge, of the order of
+        1e12, while their evidence is not enough and not above 0. The evidence is the log capital of
+        a bet that the share of wrong members is below the tolerance; under the priced rule
+        (guarantee `cost`) it is what was saved minus what errors cost, and at least 25 members
+        since the alarm (`FEWEST_SINCE_ALARM`) are needed; under the watched rule (the paper's, with
+        a safe mode) it is the log likelihood ratio of the tolerance to its double. Nothing is
+        changed.
         """
         counts: list[int] = self.member_counts_since_alarm[side].flatten().tolist()
         n = counts[0] + counts[2]

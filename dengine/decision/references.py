@@ -344,7 +344,8 @@ class RadiusIndex(nn.Module):
         labels : array, shape (n,)
             1 is success, 0 is failure; not checked.
         spaces : array of int, shape (n,), optional
-            Embedding space of each point; 0 if None.
+            Number of each point's embedding space; the points of one space come from one copy of
+            the model. 0 if None.
         parts : array of int64, shape (n,), optional
             Hash of each point's part; unknown parts (0) if None.
         numbers : array of int64, shape (n,), optional

@@ -101,12 +101,13 @@ class Learner:
         which the store has only the numbers of its traces is trained on them again, and if one of
         these is damaged or missing, no model is in force. Damaged arrays and traces are reported by
         events (rows in the store's log). A difference between store and ledger (its hash chain)
-        sets the outbox's `integrity_error`, after which every part is verified. `label_within` is
-        the number of later decisions after which a check without a report is overdue (it counts as
-        a wrong decision), and `policy_since` the first version under the policy in force. If a
-        model is in force, or the training window has at least IMPORTED labels (500), this also
-        starts a thread that computes in advance for the next retrain (`precompute`). Raises
-        StoreError if the store cannot be read, and the other errors of `LiveModel.resume`.
+        sets `integrity_error` of the outbox, through which the engine writes to the store; from
+        then on every part is verified (sent to the slow check). `label_within` is the number of
+        later decisions after which a check whose result was not reported is overdue (it counts as a
+        wrong decision), and `policy_since` the first version under the policy in force. If a model
+        is in force, or the training window has at least IMPORTED labels (500), this also starts a
+        thread that computes in advance for the next retrain (`precompute`). Raises StoreError if
+        the store cannot be read, and the other errors of `LiveModel.resume`.
         """
         version = self._store.versions.newest()
         reports = self._store.versions.retrains()

@@ -536,13 +536,13 @@ class SettingsInForce:
         """Write the settings to the store and wait for it; a failure of the store is only logged.
 
         If the engine has a journal (a local file that gets its records before the store), it waits
-        at most for the outbox's `limit` in seconds, and 2 s more for a write that is committing;
-        without a journal there is no time limit. If the store does not take the settings, or does
-        not answer in time, the error is logged, and the attribute `is_unsaved` is set, which a
-        later success clears; a commit that was too slow may still happen. Raises SettingError if
-        another robot cell of the product (cells that share labels) has settings that contradict
-        these, or the recipe of one of the two cannot be read; then nothing is written, and
-        `is_unsaved` stays as it is.
+        at most for the `limit` in seconds of the outbox, through which the engine writes to the
+        store, and 2 s more for a write that is committing; without a journal there is no time
+        limit. If the store does not take the settings, or does not answer in time, the error is
+        logged, and the attribute `is_unsaved` is set, which a later success clears; a commit that
+        was too slow may still happen. Raises SettingError if another robot cell of the product
+        (cells that share labels) has settings that contradict these, or the recipe of one of the
+        two cannot be read; then nothing is written, and `is_unsaved` stays as it is.
         """
         texts = self.now.to_store()
         try:

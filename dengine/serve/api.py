@@ -89,8 +89,8 @@ def _request_type(handler: Callable[..., Any], optional_fields: Json) -> type[St
     `**` parameter. A parameter with a default may be left out of a request, and has its default
     then. The `optional_fields`, given as types by name, may be left out too, and are msgspec's
     UNSET then. Decoding refuses unknown fields. Underscores at the end of a parameter's name are
-    left out in a request: `id_` is `id` there. The type gets the handler's docstring; its name is
-    like `ReportRequest` for the handler `report`.
+    left out in a request: `id_` is `id` there. The type gets the handler's docstring. Its name is
+    the handler's with a capital first letter, and `Request`: `ReportRequest` for `report`.
     """
     hints = get_type_hints(handler, include_extras=True)
     members: list[tuple[Any, ...]] = []
