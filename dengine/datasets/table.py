@@ -114,13 +114,13 @@ class Table:
         return np.array([words[cell] for cell in cells], dtype=object)
 
     def numbers(self, name: str, form: TextForm) -> Floats:
-        """Return a column as numbers, float64 (rows,) or (1,); a missing number is NaN.
+        """Return a column as numbers, float64 of shape (rows,); a missing number is NaN.
 
-        `form` says how numbers are written, with the decimal mark, the mark of thousands and the
-        words for a missing number; a column of numbers does not need it. Raises UnreadableError if
-        there is no such column, and for a cell that is no number of this form, is infinite, or is
-        too large for float32. An empty cell or None is such a cell, unless "" is among the words
-        for a missing number.
+        The shape is (1,) if one cell holds for all rows. `form` says how numbers are written, with
+        the decimal mark, the mark of thousands and the words for a missing number; a column of
+        numbers does not need it. Raises UnreadableError if there is no such column, and for a cell
+        that is no number of this form, is infinite, or is too large for float32. An empty cell or
+        None is such a cell, unless "" is among the words for a missing number.
         """
         cells = self.column(name)
         if cells.dtype.kind not in "iuf":

@@ -200,10 +200,10 @@ class DecisionMaker:
         """Wait until a decision and all earlier records are on disk; return the valid decision.
 
         If that takes longer than the store's time limit, or a write fails, nothing is raised: an
-        ACCEPT or REJECT is replaced by a VERIFY with `Reason.NO_STORE`, which is returned, and
-        which is not on disk yet. But if the first decision (`stored`) has reached the disk
-        meanwhile, it stays valid and is returned. A VERIFY is returned as it is, even if it is not
-        on disk.
+        ACCEPT or REJECT is replaced by a VERIFY (check the part) with `Reason.NO_STORE`, which is
+        returned, and which is not on disk yet. But if the first decision (`stored`) has reached the
+        disk meanwhile, it stays valid and is returned. A VERIFY is returned as it is, even if it is
+        not on disk.
         """
         decision = stored.decision
         try:

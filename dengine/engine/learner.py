@@ -342,13 +342,13 @@ class Learner:
     def advance(self, to_the_end: bool = False, wait: float = 0.0) -> None:
         """Take a training's outcome from the executor, or bring its version one step further.
 
-        Taking the outcome is a step; the others test the version, store it and put it in force.
-        With `to_the_end` all steps of a training that is done are taken, and the call waits for the
-        store. Nothing happens if no training is under way, or while it is not done; but a training
-        that hangs (longer than 60 s), or whose executor died, is given up and dropped (no version
-        of it is put in force). A version that cannot be stored is dropped, too. A version that is
-        stored, but lacks newer labels that the store does not take now, waits for a later call.
-        Nothing is raised.
+        The executor is a pool of workers that trains beside the engine. Taking the outcome is a
+        step; the others test the version, store it and put it in force. With `to_the_end` all steps
+        of a training that is done are taken, and the call waits for the store. Nothing happens if
+        no training is under way, or while it is not done; but a training that hangs (over 60 s), or
+        whose executor died, is given up and dropped (no version of it is put in force). A version
+        that cannot be stored is dropped, too. A version that is stored, but lacks newer labels that
+        the store does not take now, waits for a later call. Nothing is raised.
 
         `wait` is the number of seconds to wait for a training that is not done; after that it is
         given up, and so is a training that hangs. In a product (robot cells that share labels and
@@ -696,12 +696,13 @@ class Learner:
             self.wait_until_precomputed()
 
     def release(self, author: str) -> Change:
-        """Let retrains replace the version that a rollback pinned, and return the stored event.
+        """Let retrains replace the version that a rollback pinned, and return this change.
 
-        The event is a row in the store's log. The same model, with its decision rule, goes on as a
-        new version, of which `take_report` then returns a report. It is not checked that a version
-        is pinned. If the new version cannot be stored, also because another robot cell that shares
-        versions with this one stored one meanwhile, StoreError is raised and nothing changes.
+        The change is stored as an event, a row in the store's log. The same model, with its
+        decision rule, goes on as a new version, of which `take_report` then returns a report. It is
+        not checked that a version is pinned. If the new version cannot be stored, also because
+        another robot cell that shares versions with this one stored one meanwhile, StoreError is
+        raised and nothing changes.
         """
         live = self.live
         event = Change(

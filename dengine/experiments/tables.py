@@ -211,7 +211,7 @@ def table_of_numbers(
     for i, row in enumerate(rows):
         if total and i == len(rows) - 1:
             table.add_section()
-        table.add_row(*row.values())
+        table.add_row(*map(escape, row.values()))
     return table
 
 

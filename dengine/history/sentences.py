@@ -202,7 +202,7 @@ def _explain_reason(decision: Decision, trace: TraceArray, circumstances: Circum
 
 
 def _limits_left(trace: TraceArray, circumstances: Circumstances) -> Iterator[str]:
-    """Yield, as text, each force limit of the policy in `circumstances` that a trace does not keep.
+    """Yield, as text, each force limit in `circumstances` that a trace does not keep.
 
     A force limit is an operator's limit of the signal, and its text has the form
     START:END:LOW:HIGH. The limits are checked again, one by one; if the trace keeps all of them,

@@ -532,13 +532,13 @@ class ModelPrediction(EngineModel):
     def prepare(self, previous: EngineModel) -> None:
         """Take over the decision rule object of the previous model, and build the decider.
 
-        If the rule of either model is stale, because an update of it failed, this model is stale
-        afterwards. The decider, the module that decides on one trace, is built for the
-        `DecisionConditions` (force limits, sensor range and audits) under which the previous model
-        decided, or, if that never decided, for those of this model, if it has any. A decider that
-        this model has already, with the same rule and for the same conditions, is kept. Nothing
-        happens if the previous model is no `ModelPrediction`. Raises what `build_decider` raises;
-        the rule is taken over all the same.
+        A rule turns the bounds of a success probability into an action. If the rule of either model
+        is stale, because an update of it failed, this model is stale afterwards. The decider, the
+        module that decides on one trace, is built for the `DecisionConditions` (force limits,
+        sensor range and audits) under which the previous model decided, or, if that never decided,
+        for those of this model, if it has any. A decider that this model has already, with the same
+        rule and for the same conditions, is kept. Nothing happens if the previous model is no
+        `ModelPrediction`. Raises what `build_decider` raises; the rule is taken over all the same.
         """
         if not isinstance(previous, ModelPrediction):
             return

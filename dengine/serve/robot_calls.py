@@ -134,7 +134,7 @@ class RobotCalls:
         Parameters
         ----------
         request : str
-            As `begin` returned it.
+            The part's id, as `begin` returned it.
         samples : list of float, or bytes
             Bytes are raw float32, little-endian.
 

@@ -298,7 +298,8 @@ class CellService:
             What the copying of a model raises that the user gave to the engine, before a retrain;
             the label is on disk then, and the event is missing.
         BusyError
-            If the queue is full, the service is closing, or the engine's thread has ended.
+            If the queue of calls for the engine's thread is full, the service is closing, or that
+            thread has ended.
         """
         begin = time.monotonic()
         label = as_success(success)

@@ -46,13 +46,13 @@ class CorrectionTable(CellTable):
     def apply(self, change: Change) -> int:
         """Commit a person's change and its event in one transaction; return the event's number.
 
-        The change may correct labels, or withdraw them (they are then forgotten, and count
-        nowhere), store a model version, and replace the engine's settings. A correction is a row of
-        its own; the label stays as it was reported. If the version is to be put in force (it is
-        accepted), the stored arrays of older versions that are not kept any more are deleted. If
-        anything fails, nothing is written. A label that already has the new value gets a
-        correction, too. An id that is given twice gets one correction. If nothing is to be changed,
-        only the event is committed.
+        The event is the change's row in the store's log. The change may correct labels, or withdraw
+        them (they are then forgotten, and count nowhere), store a model version, and replace the
+        engine's settings. A correction is a row of its own; the label stays as it was reported. If
+        the version is to be put in force (it is accepted), the stored arrays of older versions that
+        are not kept any more are deleted. If anything fails, nothing is written. A label that
+        already has the new value gets a correction, too. An id that is given twice gets one
+        correction. If nothing is to be changed, only the event is committed.
 
         Raises
         ------

@@ -635,9 +635,9 @@ def _unpack_fields(content: bytes) -> Fields:
 
     The head is a small file beside the journal. The fields are a dict by name. DAMAGES are
     ValueError, LookupError, TypeError and AttributeError. The field "newest", which names the
-    newest entry of the ledger (the store's hash chain), becomes a pair (number, digest) or None; a
-    list in place of the fields is taken for this field alone. The CRC-32 is compared only if there
-    is one: headers of earlier releases have none.
+    newest entry of the ledger (the store's hash chain, with an entry for each transaction), becomes
+    a pair (number, digest) or None; a list in place of the fields is taken for this field alone.
+    The CRC-32 is compared only if there is one: headers of earlier releases have none.
     """
     fields = json.loads(content.rstrip(b"\0 "))
     if isinstance(fields, list):
@@ -674,7 +674,8 @@ def describe_process() -> str:
 def owned_error(owner: str, name: str) -> StoreError:
     """Return the StoreError for an engine whose robot cell another engine owns.
 
-    `owner` describes the other engine's process, and `name` what it owns; the message has both.
+    A robot cell is a robot with its sensor and its check; one engine at a time owns it. `owner`
+    describes the other engine's process, and `name` what it owns; the message has both.
     """
     return StoreError(
         f"Expected a cell that no other engine runs on, but {owner} owns {name}; close that engine "

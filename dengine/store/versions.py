@@ -217,9 +217,9 @@ class VersionTable(CellTable):
         """Return the version that the retrain with this number made, with its arrays.
 
         There must be such a retrain. A version of another robot cell is returned without the state
-        of its decision rule, which learned from that cell's outcomes, and its `rule_last_seq` is 0:
-        the rule includes no label. Raise VersionError if the state, the stored arrays, is missing
-        or damaged.
+        of its decision rule (which turns the bounds of a success probability into an action), for
+        the rule learned from that cell's outcomes, and its `rule_last_seq` is 0: the rule includes
+        no label. Raise VersionError if the state, the stored arrays, is missing or damaged.
         """
         query = sa.select(*VERSION.c["cell_id", "version", "last_seq", "state", "state_sum"]).where(
             self._shared, VERSION.c.retrain == retrain

@@ -253,10 +253,11 @@ class UrCell(AbstractContextManager["UrCell"]):
     def _find_result(self, row: Row, verb: Verb) -> ResultCode | None:
         """Return the result of the present order (`verb`) if the package `row` holds it, else None.
 
-        A package is the values that the robot sends at once. It holds the result if the number in
-        its register of results is that of the order. Raise CellError if the result is FAILED, VOID
-        (the program was started anew) or one that this order cannot have, or if the robot's program
-        has stopped and this package holds no result.
+        An order is a command to the robot, and a package is the values that it sends at once. A
+        package holds the result if the number in its register of results is that of the order.
+        Raise CellError if the result is FAILED, VOID (the program was started anew) or one that
+        this order cannot have, or if the robot's program has stopped and this package holds no
+        result.
         """
         number, code = divmod(int(row.values[ANSWER]), 10)
         if number == self._number:
@@ -275,10 +276,11 @@ class UrCell(AbstractContextManager["UrCell"]):
     def _wait_until_ready(self) -> int:
         """Wait until the robot's program is ready; return the number of its last order.
 
-        It is ready if it runs and has answered its last order: the numbers of the order and of the
-        result in the registers must be equal. Packages (the values that the robot sends at once)
-        that arrive before are discarded. Raise CellError after `start_timeout` seconds; its message
-        says whether the robot sent nothing, its program does not run, or it has not answered.
+        It is ready if it runs and has answered its last order (a command, like INSERT): the numbers
+        of the order and of the result in the registers must be equal. Packages (the values that the
+        robot sends at once) that arrive before are discarded. Raise CellError after `start_timeout`
+        seconds; its message says whether the robot sent nothing, its program does not run, or it
+        has not answered.
         """
         problem = ""
         for row in self.recorder.stream.rows(self.start_timeout):

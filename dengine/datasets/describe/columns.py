@@ -235,8 +235,8 @@ class Proposal:
     def unused(self) -> list[Column]:
         """The columns that have no role in the description yet.
 
-        Columns of the clock, the part, labels and channels have one, those whose words tell which
-        rows are samples (`[rows]`), the column of `order` and the signals of the trigger, the
+        Columns of the clock, part numbers, labels and channels have one, those whose words tell
+        which rows are samples (`[rows]`), the column of `order` and the signals of the trigger, the
         condition at which long recordings are cut. Raises SettingError for a malformed trigger.
         """
         about = self.description
