@@ -10,7 +10,7 @@ import pytest
 from dengine import DataEngine, Description, load_dataset
 from dengine.datasets.sample import write_sample
 from dengine.experiments.survey import survey_dataset
-from tests.support.command_line import dengine, document, well
+from tests.support.command_line import dengine, document, refused, well
 
 
 def shown(*words: object) -> str:
@@ -93,10 +93,3 @@ def test_what_is_wrong_with_traces_is_counted(make_data):
     assert survey.duplicates == 2
     assert 14 <= survey.near_repeats <= 20
     assert survey_dataset(data).near_repeats <= 3
-
-
-def refused(*words: object) -> str:
-    """Return the error of a command that must fail."""
-    result = dengine(*words)
-    assert result.exit_code == 1, result.output
-    return result.stderr

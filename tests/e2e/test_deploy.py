@@ -9,7 +9,6 @@ import shlex
 import shutil
 import subprocess
 import sys
-import tomllib
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
@@ -25,16 +24,14 @@ from dengine.records import Action, Reason
 from dengine.serve.auth import read_tokens
 from dengine.serve.http import create_app
 from dengine.serve.metrics import Metrics
-from tests.support.command_line import dengine, well
-from tests.support.serving import a_service, served
+from tests.support.command_line import refused, well
+from tests.support.serving import REPO, a_service, served
 
-REPO = Path(__file__).resolve().parents[2]
 DEPLOY = REPO / "dengine" / "serve" / "deploy"
 CONTAINER, UNIT, OPTIONS = (
     (DEPLOY / name).read_text(encoding="utf-8")
     for name in ("Containerfile", "dengine.service", "dengine.env")
 )
-PROJECT = tomllib.loads((REPO / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 
 
 def steps(name: str) -> list[str]:
@@ -63,8 +60,7 @@ def test_the_examples_are_written_by_serve_into_a_new_folder_alone(tmp_path):
     assert contents == {path.name: path.read_bytes() for path in DEPLOY.iterdir()}
     readme = contents.pop("README.md").decode()
     assert {*re.findall("^. `([^`]+)` .", readme, flags=re.M)} == {*contents}
-    refused = dengine("serve", "--deploy", folder)
-    assert (refused.exit_code, "Expected a new or an empty folder" in refused.stderr) == (1, True)
+    assert "Expected a new or an empty folder" in refused("serve", "--deploy", folder)
 
 
 def test_what_the_container_starts_is_an_option_each_of_serve():

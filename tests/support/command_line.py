@@ -42,6 +42,13 @@ def line_of(*words: object) -> str:
     return " ".join(succeed(*words).replace("│", " ").replace("┃", " ").split())
 
 
+def refused(*words: object) -> str:
+    """Return in one line the error of a verb that must end with exit code 1."""
+    result = dengine(*words)
+    assert result.exit_code == 1, result.output
+    return " ".join(result.stderr.split())
+
+
 def document(*words: object) -> dict:
     """Return the JSON document of a verb, which must print nothing else."""
     result = well(*words, "--json")
