@@ -65,6 +65,11 @@ def evidence(d: Decision) -> tuple:
     )
 
 
+def rule_state(engine: DataEngine) -> dict[str, list]:
+    """What the decision rule has learned."""
+    return {name: value.tolist() for name, value in engine.model.rule.state_dict().items()}
+
+
 def learn(engine: DataEngine, data: Dataset, rows: Iterable[int]) -> None:
     """Decide on parts, and report all that may be reported."""
     for i in rows:

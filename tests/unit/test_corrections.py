@@ -13,7 +13,7 @@ from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
 
 from dengine import Action, DataEngine, Dataset, Reason, Recipe
 from dengine.errors import SettingError
-from tests.support.driving import RECIPE, Counting, evidence, make
+from tests.support.driving import RECIPE, Counting, evidence, make, rule_state
 from tests.support.driving import drive as play
 
 
@@ -38,13 +38,12 @@ def asked(engine: DataEngine, data: Dataset) -> list:
 def state(engine: DataEngine) -> tuple:
     """All that decides what an engine does next."""
     stored = engine.store.labels.with_traces(engine.recipe.window)
-    model = engine.model
     return (
         (engine.version, engine.state.new_labels, engine.safe_mode, engine.policy),
         engine.certificate(),
-        {name: value.tolist() for name, value in model.rule.state_dict().items()},
+        rule_state(engine),
         (stored.seq.tolist(), stored.labels.tolist()),
-        sorted(model.index.column("numbers").tolist()),
+        sorted(engine.model.index.column("numbers").tolist()),
     )
 
 

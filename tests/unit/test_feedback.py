@@ -31,6 +31,7 @@ from dengine.model.neighbours import repeats_note
 from dengine.store.records import Change, NewLabel
 from dengine.store.verification import verify_history
 from tests.support.driving import drive as play
+from tests.support.driving import rule_state
 from tests.support.stores import execute
 
 LOCAL = Policy(alpha=0.1, lower_bound=0.9)
@@ -239,11 +240,6 @@ def test_repeats_that_nobody_names_are_noticed_and_named_ones_or_parts_of_their_
         assert ("same number each time it comes" in engine.status().alarm) is (parts is None)
 
 
-def told(engine: DataEngine) -> dict[str, list]:
-    """What the rule has learned."""
-    return {name: value.tolist() for name, value in engine.model.rule.state_dict().items()}
-
-
 @pytest.mark.parametrize("policy", [replace(LOCAL, audit_rate=0.2), POOLED])
 def test_a_report_on_a_rejected_part_is_kept_and_trains_and_the_rule_is_not_told(
     policy, stream, tmp_path
@@ -254,10 +250,10 @@ def test_a_report_on_a_rejected_part_is_kept_and_trains_and_the_rule_is_not_told
         good, bad, *_ = [d.id for d in decisions if d.action is Action.REJECT]
         engine.poll()
         engine.flush()
-        before, labels = told(engine), (engine.status().labels, engine.state.new_labels)
+        before, labels = rule_state(engine), (engine.status().labels, engine.state.new_labels)
         engine.report(good, True)
         engine.report(bad, False)
-        assert told(engine) == before
+        assert rule_state(engine) == before
         status = engine.status()
         assert (status.labels - 2, engine.state.new_labels - 2) == labels
         assert (status.sources["inspection"], status.ever.false_rejects) == (2, 1)
@@ -266,10 +262,10 @@ def test_a_report_on_a_rejected_part_is_kept_and_trains_and_the_rule_is_not_told
         engine.correct(good, False)
         assert engine.status().ever.false_rejects == 0
         engine.flush()
-        rule = told(engine)
+        rule = rule_state(engine)
     with DataEngine.open(tmp_path / "engine.db", replaying=True) as engine:
         assert (engine.find(good).success, engine.find(good).source) == (False, Source.INSPECTION)
-        assert told(engine) == rule
+        assert rule_state(engine) == rule
 
 
 def test_false_rejects_bound_the_certificate_from_below_and_are_an_alarm_where_they_are_many(

@@ -23,8 +23,8 @@ from dengine.store import verify_history
 from dengine.store.peers import list_cells
 from dengine.store.schema import VERSION
 from tests.conftest import DATABASES, insertion_like, url_of
-from tests.support.command_line import dengine, document, succeed
-from tests.support.driving import learn
+from tests.support.command_line import document, refused, succeed
+from tests.support.driving import learn, rule_state
 
 EVERY = 20
 RECIPE = Recipe("pca", {"n_components": 2}, radius=0.4, retrain_every=EVERY).with_policy(
@@ -97,10 +97,6 @@ def counts(engine: DataEngine, probe: np.ndarray) -> list[tuple[int, int]]:
     return [(p.n_success, p.n_failure) for p in engine.model.predict_many(probe)]
 
 
-def rule(engine: DataEngine) -> dict[str, list[float]]:
-    return {name: value.tolist() for name, value in engine.model.rule.state_dict().items()}
-
-
 def taught(fleet: Fleet, parts: Dataset, n: int, recipe: Recipe = RECIPE) -> list[DataEngine]:
     """Two cells of one product that learned n parts by turns, and have one version of them all."""
     cells = [fleet.engine(name, recipe=recipe) for name in "ab"]
@@ -120,11 +116,11 @@ def share(first: DataEngine, *others: DataEngine) -> None:
 
 def must_be_as(fleet: Fleet, before: DataEngine, probe: np.ndarray) -> None:
     """Open a cell again, whose product is known; it must say what it said."""
-    said, learned = predictions(before, probe), rule(before)
+    said, learned = predictions(before, probe), rule_state(before)
     before.close()
     fleet.opened.remove(before)
     after = fleet.engine("", recipe=None, store=SqlStore(fleet.url, before.store.cell_id))
-    assert (predictions(after, probe), rule(after)) == (said, learned)
+    assert (predictions(after, probe), rule_state(after)) == (said, learned)
 
 
 def numbers(engine: DataEngine) -> list[int]:
@@ -169,7 +165,6 @@ def test_each_cell_retrains_by_its_own_labels_since_the_newest_version(fleet, pa
     for start in range(0, 38, 2):
         learn(first, parts, [start])
         learn(second, parts, [start + 1])
-    assert first.store.versions.retrains() == []
     learn(second, parts, [38, 39])
     assert first.store.versions.retrains() == []
     learn(first, parts, [40])
@@ -258,7 +253,8 @@ def test_no_cell_replaces_what_a_peer_rolled_back_to_before_one_of_them_releases
     second.release()
     for engine in cells:
         engine.poll()
-        assert (engine.version > pinned, engine.status().pinned) == (True, 0)
+        assert engine.version > pinned
+        assert engine.status().pinned == 0
 
 
 @ON_BOTH
@@ -422,6 +418,6 @@ def test_every_verb_that_names_a_store_names_a_cell(fleet, parts, tmp_path):
         own = store.labels.with_traces(cell_only=True)
         assert len(store.labels.with_traces().seq) > len(own.seq) > 0
     for words in (["status"], ["export", "--out", names["MODEL"]]):
-        done = dengine(*words, fleet.url, "--cell", "another")  # which is not made
-        assert (done.exit_code, "it holds " in done.output) == (1, True)
+        # The cell is not made.
+        assert "it holds " in refused(*words, fleet.url, "--cell", "another")
     assert "another" not in [row.cell_id for row in list_cells(fleet.url)]

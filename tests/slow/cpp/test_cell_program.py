@@ -18,6 +18,7 @@ from dengine import DataEngine, Dataset, TraceSpec, export_torchscript
 from dengine.export import import_journal, make_key
 from dengine.export.cell_journal import read_journal
 from dengine.records import Action
+from tests.support.driving import rule_state
 from tests.support.exports import FORCE_LIMITS, SAMPLES, trained
 from tests.support.programs import Program, asked, must_agree
 from tests.support.tables import rows
@@ -87,7 +88,7 @@ def state_of(store: Path) -> list[Any]:
                 (item.lower, item.upper, item.success, item.novel, item.silent)
                 for item in engine.store.labels.outcomes_since(400)
             ],
-            {name: value.tolist() for name, value in engine.model.rule.state_dict().items()},
+            rule_state(engine),
             engine.store.decisions.counts()["sources"],
             engine.store.labels.with_traces().hashes.tolist(),
             (outcomes.false_accepts, outcomes.confirmed),
