@@ -3,14 +3,12 @@ is not taken for one.
 """
 
 import shutil
-import sqlite3
 import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
@@ -20,18 +18,9 @@ from dengine import DataEngine, SqlStore
 from dengine.store import backup_store, verify_history
 from tests.support.command_line import document, line_of, refused
 from tests.support.driving import learn
-from tests.support.stores import execute
+from tests.support.stores import execute, held
 
 IN_STORE, IN_JOURNAL = 40, 25  # parts
-
-
-@contextmanager
-def held(file: Path) -> Iterator[None]:
-    """Another process holds the database, so that records wait in journals."""
-    with closing(sqlite3.connect(file, isolation_level=None)) as other:
-        other.execute("BEGIN IMMEDIATE")
-        yield
-        other.execute("ROLLBACK")
 
 
 @pytest.fixture
@@ -144,7 +133,6 @@ def test_a_cell_moves_to_another_machine_by_backup_and_restore_unless_its_histor
     assert not (tmp_path / "third.db").exists()
 
 
-# Of a journal that cannot be read no backup is made.
 # The store, the copy and the reason. Of a journal that cannot be read no backup is made.
 REFUSED = """
 engine.db   engine.db        is a database

@@ -2,8 +2,6 @@
 
 import re
 import shutil
-import sqlite3
-from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -13,6 +11,7 @@ from dengine.store import journal
 from dengine.store.verification import verify_history
 from tests.support.command_line import dengine, document
 from tests.support.driving import learn
+from tests.support.stores import held
 
 IN_STORE, IN_JOURNAL = 6, 10  # parts
 
@@ -28,13 +27,11 @@ def left(data, tmp_path_factory):
     with DataEngine("pca", retrain_every=1000, store=store) as engine:
         learn(engine, data, range(IN_STORE))
         engine.flush()
-        with closing(sqlite3.connect(store, isolation_level=None)) as other:
-            other.execute("BEGIN IMMEDIATE")
+        with held(store):
             learn(engine, data, range(IN_STORE, IN_STORE + 5))
             shutil.copy(f"{store}.cell.journal.head", left / "engine.db.cell.journal.head.old")
             learn(engine, data, range(IN_STORE + 5, IN_STORE + IN_JOURNAL))
             shutil.copytree(folder, left, dirs_exist_ok=True)
-            other.execute("ROLLBACK")
     return left
 
 

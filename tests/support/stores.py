@@ -1,6 +1,8 @@
 """Decisions, labels and reports as tests make them, and into a store, as a journal brings them."""
 
 import sqlite3
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -39,6 +41,15 @@ def execute(file: Path | str, *statements: str) -> None:
     with sqlite3.connect(file) as connection:
         for statement in statements:
             connection.execute(statement)
+
+
+@contextmanager
+def held(file: Path) -> Iterator[None]:
+    """Another process holds the database, so that records wait in journals."""
+    with closing(sqlite3.connect(file, isolation_level=None)) as other:
+        other.execute("BEGIN IMMEDIATE")
+        yield
+        other.execute("ROLLBACK")
 
 
 def put_decision(
