@@ -4,6 +4,7 @@ must not be used.
 
 import hashlib
 import json
+import shutil
 import zipfile
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -166,8 +167,7 @@ def test_the_file_says_what_it_is_without_being_loaded(audited, file, monkeypatc
     assert Recipe.from_toml(metadata["recipe"]) == audited.recipe
     assert (metadata["schema"], metadata["model_version"]) == (2, audited.version)
     assert metadata["references"] == len(audited.model.index)
-    digest = hashlib.sha256(file.read_bytes()).hexdigest()  # as sha256sum reads it
-    assert file.with_name("model.ts.sha256").read_text() == f"{digest}  model.ts\n"
+    assert file.with_name("model.ts.sha256").read_text() == sum_of(file)
 
 
 def test_loading_unpickles_nothing_in_python(file, monkeypatch):
@@ -179,17 +179,14 @@ def test_loading_unpickles_nothing_in_python(file, monkeypatch):
     load_exported(file)
 
 
-def sum_anew(path: Path) -> None:
-    digest = hashlib.sha256(path.read_bytes()).hexdigest()
-    path.with_name(path.name + ".sha256").write_text(f"{digest}  {path.name}\n")
+def sum_of(file: Path) -> str:
+    """What stands beside a file, as sha256sum reads it."""
+    return f"{hashlib.sha256(file.read_bytes()).hexdigest()}  {file.name}\n"
 
 
 @pytest.fixture
 def copy(file, tmp_path):
-    target = tmp_path / "model.ts"
-    target.write_bytes(file.read_bytes())
-    sum_anew(target)
-    return target
+    return Path(shutil.copytree(file.parent, tmp_path / "copy")) / file.name
 
 
 @pytest.mark.parametrize("kind", ["flip", "truncation", "block"])
@@ -239,7 +236,7 @@ FOREIGN = {  # by what is said of it
 @pytest.mark.parametrize("words", FOREIGN)
 def test_a_foreign_file_with_its_sum_is_refused(copy, words):
     FOREIGN[words](copy)
-    sum_anew(copy)
+    copy.with_name("model.ts.sha256").write_text(sum_of(copy))
     with pytest.raises(ExportError, match=words):
         load_exported(copy)
 

@@ -112,11 +112,11 @@ def opened(page: Page, demo: DemoCell, view: str = "") -> None:
     )  # of the view, once the server has answered
 
 
-def confirmed(page: Page, button: str, author: str = "") -> None:
-    """author : "" where it is remembered, or the token has a name."""
+def confirmed(page: Page, button: str, label: str = "", text: str = "") -> None:
+    """Click a button and confirm; label, text : what is filled in before that."""
     page.get_by_role("button", name=button).click()
-    if author:
-        page.get_by_label("Your name").fill(author)
+    if label:
+        page.get_by_label(label).fill(text)
     page.get_by_role("button", name="Do it").click()
     expect(page.get_by_role("dialog")).to_be_hidden(timeout=PATIENT)
 
@@ -169,7 +169,7 @@ def test_versions_are_rolled_back_released_and_trained_and_a_label_corrected_by_
         played(service, stream, 40)
         service.submit(lambda engine, late: engine.retrain()).result()
         opened(page, demo, "actions")
-        confirmed(page, "Roll back", AUTHOR)
+        confirmed(page, "Roll back", "Your name", AUTHOR)
         expect(page.locator("#result")).to_contain_text("Version 1 answers again")
         confirmed(page, "Release the version")
         confirmed(page, "Retrain now")
@@ -263,10 +263,7 @@ def a_day(page: Page, demo: DemoCell, part: str, file: Path) -> None:
     shown("#banner", "every part is verified")
     confirmed(page, "Let the model decide again")
     shown("#mode", "Decides")
-    page.get_by_role("button", name="Change the policy").click()
-    page.get_by_label("Force limits").fill("0.01:0.05::30:reject")
-    page.get_by_role("button", name="Do it").click()
-    expect(page.get_by_role("dialog")).to_be_hidden(timeout=PATIENT)
+    confirmed(page, "Change the policy", "Force limits", "0.01:0.05::30:reject")
     opened(page, demo, "history?label=bad")
     with page.expect_download() as download:
         page.get_by_role("button", name="Download these as CSV").click()

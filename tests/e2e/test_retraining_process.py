@@ -32,11 +32,16 @@ def running():
         process.shutdown()
 
 
+def pid_of(process: RetrainingProcess) -> int:
+    """The number of the process, which answers once it has started."""
+    return process.submit(os.getpid).result(300)
+
+
 @pytest.fixture
 def process(running):
     if not running:
         running.append(RetrainingProcess())
-        running[0].submit(os.getpid).result(300)
+        pid_of(running[0])
     return running[0]
 
 
@@ -55,7 +60,7 @@ def test_a_call_is_answered_there_its_error_raised_and_its_arrays_and_tensors_ar
         assert np.array_equal(torch.as_tensor(received).detach(), torch.as_tensor(was).detach())
         with torch.no_grad():
             received[:1] = 7.0
-    assert process.submit(os.getpid).result(300) != os.getpid()
+    assert pid_of(process) != os.getpid()
     with pytest.raises(ZeroDivisionError):
         process.submit(divmod, 17, 0).result(300)
     with pytest.raises(Exception, match="pickle"):
@@ -80,11 +85,11 @@ def test_a_conv_retrain_there_ends_where_one_in_a_thread_ends(process, data, cap
 def test_a_process_that_died_or_hangs_is_started_again_and_no_change_waits_while_it_imports(
     process, data, monkeypatch
 ):
-    pids = [process.submit(os.getpid).result(300)]
+    pids = [pid_of(process)]
     engine = DataEngine(recipe=PCA, executor=process)
     os.kill(pids[0], signal.SIGKILL)
     with pytest.raises(BrokenExecutor):
-        process.submit(os.getpid).result(300)
+        pid_of(process)
     with monkeypatch.context() as patched:
         patched.setattr(trainer, "HUNG", 0.001)  # one that still imports is not taken for hung
         learn(engine, data, range(30))
@@ -97,7 +102,7 @@ def test_a_process_that_died_or_hangs_is_started_again_and_no_change_waits_while
     settle(engine)
     reasons = [report.reason.partition(";")[0] for report in engine.store.versions.retrains()]
     assert reasons == ["accepted", "another policy, the same model", "accepted"]
-    pids.append(process.submit(os.getpid).result(300))
+    pids.append(pid_of(process))
     process.submit(time.sleep, 600)
     assert engine.retrain(wait=False) is None  # there
     with monkeypatch.context() as patched:
@@ -105,7 +110,7 @@ def test_a_process_that_died_or_hangs_is_started_again_and_no_change_waits_while
         engine.poll()
     assert engine.retrain(wait=False) is None
     settle(engine)
-    pids.append(process.submit(os.getpid).result(300))
+    pids.append(pid_of(process))
     accepted = [report.accepted for report in engine.store.versions.retrains()[3:]]
     assert (accepted, engine.version) == ([False, True], 4)
     assert len({*pids}) == 3
@@ -114,7 +119,7 @@ def test_a_process_that_died_or_hangs_is_started_again_and_no_change_waits_while
 def test_it_ends_with_whoever_made_it_also_at_work(process, running):
     running.clear()
     with process:
-        pid = process.submit(os.getpid).result(300)
+        pid = pid_of(process)
         at_work = process.submit(time.sleep, 600)
     with pytest.raises(ProcessLookupError):
         os.kill(pid, 0)

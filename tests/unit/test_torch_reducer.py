@@ -68,11 +68,14 @@ def own_reducer(network=SmallNetwork) -> TorchReducer:
     return TorchReducer(network=network, folds=2, steps=4, fit_steps=30)
 
 
+either_network = pytest.mark.parametrize("make", [quick, own_reducer], ids=["conv", "own network"])
+
+
 def noise(*shape: int) -> torch.Tensor:
     return torch.randn(*shape, generator=torch.Generator().manual_seed(0))
 
 
-@pytest.mark.parametrize("make", [quick, own_reducer], ids=["conv", "own network"])
+@either_network
 def test_labels_of_fold_k_move_nothing_in_space_k_over_warm_starts_weights_averages_and_statistics(
     make,
 ):
@@ -115,7 +118,7 @@ def test_no_step_begins_after_the_deadline_and_the_reducer_answers_all_the_same(
     assert np.isfinite(reducer.embed(X)).all()
 
 
-@pytest.mark.parametrize("make", [quick, own_reducer], ids=["conv", "own network"])
+@either_network
 def test_without_time_for_a_step_known_traces_keep_their_points_and_new_ones_are_embedded(make):
     reducer = make()
     folds = content_fold(X, reducer.folds)
