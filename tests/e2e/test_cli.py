@@ -287,6 +287,7 @@ compare --alphas 0.1 --alpha 0.1  --alpha gives one value
 compare --reducers pca,pca        a name of its own
 compare --intervals wald          'wald' is not one of 'wilson', 'binomial'
 train                             Missing option
+costs --data missing.npz --escape 20 --false-reject 10 --alpha 0.1  use --alphas
 """
 
 

@@ -170,15 +170,6 @@ def share_of(wrong: int, n: int, alpha: float) -> Any:
     return pytest.approx([n, wrong, 1 - upper, 1 - lower])
 
 
-WRONG = """
-2 history --since yesterday  expected 30m, 12h, 7d or 2026-03-01T14:30, got 'yesterday'
-2 history --action pass      'pass' is not one of
-2 history --reason why       'why' is not one of
-2 history --last 0           0 is not in the range
-1 explain nonsense           or a decision's id, got 'nonsense', which is unknown; `dengine history
-"""
-
-
 @pytest.fixture(scope="module")
 def decisions(store):
     """All decisions of the store, oldest first."""

@@ -26,7 +26,7 @@ from dengine.experiments.costs import (
 from dengine.experiments.grid import Task
 from dengine.experiments.metrics import Costs
 from dengine.experiments.replay import Contender, Replay, replay, replay_policy
-from tests.support.command_line import dengine, document, succeed
+from tests.support.command_line import document, succeed
 from tests.support.replays import replay_of
 
 COSTS = Costs(check=5, escape=100, false_reject=20)
@@ -309,9 +309,3 @@ def test_the_verb_shows_a_table_and_writes_the_curve(recordings):
         assert engine.policy == eval(result["python"], {"Policy": Policy})
     # Other prices, the same replays.
     assert document(*WORDS, "--escape", "21")["costs"]["escape"] == 21
-
-
-def test_the_verb_names_an_option_that_takes_a_list(recordings):
-    result = dengine(*WORDS, "--alpha", "0.1")
-    assert result.exit_code == 2
-    assert "use --alphas" in result.output

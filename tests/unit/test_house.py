@@ -6,15 +6,13 @@ import sys
 from contextlib import suppress
 from functools import cache
 from importlib import import_module
-from pathlib import Path
 from typing import Protocol
 
 from dengine import DataEngine, TorchReducer
 from dengine.decision.rule import DecisionRule
 from tests.slow.faults.__main__ import MUTATIONS
-from tests.support.faults import read_faults
+from tests.support.faults import REPO, read_faults
 
-REPO = Path(__file__).resolve().parents[2]
 PACKAGE = REPO / "dengine"
 FILES = {
     ".".join(file.relative_to(REPO).with_suffix("").parts): file

@@ -85,7 +85,6 @@ def test_a_part_that_comes_twice_in_one_import_counts_once(store, X, tmp_path):
     assert (report.imported, report.repeated, report.contradicted) == (1, 1, 1)
 
 
-# Of each line: the part, and its label's bound, success, how many were silent before it, novelty.
 # Of each line: the part, and its label's bound, success and novelty; none is known of the last, and
 # of the second only where all stops are reported.
 CELL = """

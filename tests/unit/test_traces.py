@@ -93,7 +93,6 @@ NO_CONTRACTS = {
     "at least 1 sample": {"samples": 0},
     "rate above 0": {"samples": 10, "rate_hz": 0.0},
     "Expected fit to be one of strict, cut, pad, resample": {"samples": 10, "fit": "stretch"},
-    "Expected 2 different columns": {"samples": 10, "channels": 2, "columns": ("a", "a")},
 }
 
 

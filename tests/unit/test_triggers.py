@@ -9,8 +9,6 @@ from dengine.datasets.triggers import Start, StartFinder, Trigger, as_trigger, p
 from dengine.errors import SettingError
 
 STEP = 0.002
-BITS = "actual_digital_output_bits"
-
 
 SIGNALS = """
 bit=2         actual_digital_output_bits  0 4 3 7      0 1 0 1

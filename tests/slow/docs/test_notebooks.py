@@ -12,7 +12,6 @@ from typing import Any
 import pytest
 
 FOLDER = Path(__file__).parents[3] / "notebooks"
-INDEX = FOLDER.parent / "docs" / "notebooks" / "index.md"
 NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
 MAX_BYTES = 600_000  # of a notebook with its pictures
 # Notebook -> text of its code, and the text that replaces it to make long cells quick.
