@@ -1,9 +1,10 @@
 """The line in front of an engine: who asks, who waits, who is told what."""
 
 import asyncio
+import queue
 import shutil
 import threading
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing
 
 import pytest
@@ -95,27 +96,23 @@ def test_a_service_whose_second_connection_fails_closes_its_engine_and_ends_its_
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
-def test_a_service_whose_thread_died_behind_a_full_line_closes_all_the_same(tmp_path):
-    is_polling = threading.Event()
-    is_full = threading.Event()
+def test_a_service_whose_thread_died_behind_a_full_line_closes_all_the_same():
+    waiting: queue.Queue[Future] = queue.Queue()
+    may_die = threading.Event()
 
     def die(**brief):
-        is_polling.set()
-        is_full.wait(WAIT)
+        waiting.put(service.submit(lambda engine, late: None))
+        may_die.wait(WAIT)
         raise SystemExit
 
-    def make():
-        engine = DataEngine.open_or_create(tmp_path / "a.db")
-        engine.poll = die
-        return engine
-
-    service = CellService(make, max_waiting=1)
-    assert is_polling.wait(WAIT)  # the thread takes no job any more
-    waiting = service.submit(lambda engine, late: None)
-    is_full.set()
+    service = CellService(lambda: DataEngine("pca"), max_waiting=1)
+    service.engine.poll = die
+    unanswered = waiting.get(timeout=WAIT)
     closing_thread = threading.Thread(target=service.close, daemon=True)
     closing_thread.start()
+    closing_thread.join(0.1)  # it waits for room in the line
+    may_die.set()
     closing_thread.join(WAIT)
     assert not closing_thread.is_alive()
     with pytest.raises(BusyError):
-        waiting.result(0)
+        unanswered.result(0)
