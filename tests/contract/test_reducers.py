@@ -16,6 +16,7 @@ from torch import nn
 from dengine import (
     REDUCERS,
     DataEngine,
+    Dataset,
     ModelPrediction,
     Policy,
     Reason,
@@ -27,6 +28,7 @@ from dengine.errors import SettingError
 from dengine.reducers import Reducer, TorchReducer
 from dengine.store import StoredDecision
 from dengine.testing import REDUCER_CHECKS, check_reducer, toy_traces
+from tests.support.driving import learn
 from tests.support.stores import decision, labelled
 
 QUICK: dict[str, dict[str, Any]] = {
@@ -65,8 +67,7 @@ def test_every_reducer_but_umap_learn_is_exported_restored_and_compiled(name):
     X, y = toy_traces()
     fitted = new(name).fit(X, y)
     engine = DataEngine(reducer=new(name))
-    for x, good in zip(X, y, strict=True):
-        engine.report(engine.decide(x).id, bool(good))
+    learn(engine, Dataset(X, y), range(len(y)))
     assert engine.retrain().accepted
     can = (
         fitted.module() is not None,
@@ -105,14 +106,14 @@ def test_an_unknown_setting_is_an_error_that_lists_the_known(name):
 class Means(Reducer):
     """A reducer of somebody else's, the least that is needed: means of the halves of a trace."""
 
-    def __init__(self, n_components: int = 2) -> None:
+    def __init__(self, n_components=2):
         self.n_components = n_components
 
-    def fit(self, X: Any, y: Any = None) -> "Means":
+    def fit(self, X, y=None):
         self.check_traces(X, reset=True)
         return self
 
-    def transform(self, X: Any) -> np.ndarray:
+    def transform(self, X):
         halves = np.array_split(self.check_traces(X), self.n_components, axis=2)
         return np.stack([half.mean(axis=(1, 2)) for half in halves], axis=1)
 
@@ -122,13 +123,11 @@ class Peeking(Means):
 
     uses_labels, n_spaces = True, 2
 
-    def train(
-        self, X: Any, y: Any, folds: Any, stop: Any = None, numbers: Any = None
-    ) -> np.ndarray:
+    def train(self, X, y, folds, stop=None, numbers=None):
         self.rate_ = float(np.mean(y * np.arange(len(y))))
         return self.fit(X).embed_references(X, folds)
 
-    def embed(self, X: Any) -> np.ndarray:
+    def embed(self, X):
         Z = self.transform(X) * getattr(self, "rate_", 1.0)
         return np.stack([Z, Z], axis=1).astype(np.float32)
 
@@ -136,18 +135,18 @@ class Peeking(Means):
 class Forgetful(Means):
     """`fit` goes on from an earlier fit."""
 
-    def fit(self, X: Any, y: Any = None) -> "Forgetful":
+    def fit(self, X, y=None):
         self.gain_ = getattr(self, "gain_", 1.0) * 2.0
         return super().fit(X)
 
-    def transform(self, X: Any) -> np.ndarray:
+    def transform(self, X):
         return super().transform(X) * self.gain_
 
 
 class Overwriting(Means):
     """Writes to the caller's traces."""
 
-    def transform(self, X: Any) -> np.ndarray:
+    def transform(self, X):
         out = super().transform(X)
         np.asarray(X)[:] = 0.0
         return out
@@ -156,17 +155,17 @@ class Overwriting(Means):
 class Unsaid(Means):
     """Needs labels, and does not say so."""
 
-    def fit(self, X: Any, y: Any = None) -> "Unsaid":
+    def fit(self, X, y=None):
         return super().fit(X + 0 * y.mean())
 
 
 class Unbounded(TransformerMixin, BaseEstimator):
     """A transformer that gives infinities."""
 
-    def fit(self, X: Any, y: Any = None) -> "Unbounded":
+    def fit(self, X, y=None):
         return self
 
-    def transform(self, X: Any) -> np.ndarray:
+    def transform(self, X):
         return np.full((len(X), 2), np.inf)
 
 
@@ -199,13 +198,12 @@ def test_a_reducer_that_fails_at_every_retrain_is_told_with_its_reason(make_data
 class Linear(nn.Module):
     """The smallest network of somebody else's."""
 
-    def __init__(self, channels: int, samples: int) -> None:
+    def __init__(self, channels, samples):
         super().__init__()
         self.layers = nn.Sequential(nn.Flatten(), nn.Linear(channels * samples, 8), nn.ReLU())
 
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        features: torch.Tensor = self.layers(x)
-        return features
+    def forward(self, x):
+        return self.layers(x)
 
 
 EXTREME = {  # what a labelled trace may hold; the last two only in a store of before they were a fault
@@ -234,15 +232,12 @@ def test_whatever_a_labelled_trace_holds_later_retrains_succeed_and_the_model_st
 ):
     X, y = toy_traces(180)
     X = X.reshape(len(X), -1)
+    data = Dataset(X, y)
     policy, options = Policy(alpha=0.4, lower_bound=0.7), {"replaying": True, "retrain_every": 1000}
     engine = DataEngine(TEACHABLE[name](), policy=policy, store=tmp_path / "e.db", **options)
 
-    def learn(rows: range) -> None:
-        for i in rows:
-            engine.report(engine.decide(X[i]).id, bool(y[i]))
-
     if not first:
-        learn(range(150))
+        learn(engine, data, range(150))
         assert engine.retrain().accepted
     engine.decide(X[0])  # it sets the TraceSpec
     engine.close()
@@ -255,20 +250,12 @@ def test_whatever_a_labelled_trace_holds_later_retrains_succeed_and_the_model_st
             store.apply_records(labelled(item, bool(y[150 + i])))
     engine = DataEngine.open(tmp_path / "e.db", reducer=TEACHABLE[name](), replaying=True)
     if first:
-        learn(range(150))
+        learn(engine, data, range(150))
     reports = [engine.retrain() for _ in range(2)]
     assert [report.reason for report in reports if not report.accepted] == []
-    texts = [engine.decide(x) for x in X[160:]]
-    assert not {Reason.MODEL_ERROR, Reason.NOVEL} & {report.reason for report in texts}
-    middle = [
-        np.mean(
-            [
-                report.n_success - report.n_failure
-                for report, good in zip(texts, y[160:], strict=True)
-                if good == k
-            ]
-        )
-        for k in (0, 1)
-    ]
-    assert middle[0] < middle[1]
+    decisions = [engine.decide(x) for x in X[160:]]
+    assert not {Reason.MODEL_ERROR, Reason.NOVEL} & {item.reason for item in decisions}
+    votes = np.array([item.n_success - item.n_failure for item in decisions])
+    is_good = y[160:] == 1
+    assert votes[~is_good].mean() < votes[is_good].mean()
     engine.close()
