@@ -7,19 +7,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dengine.engine.trainer import TrainingWindow
-from dengine.store.records import LabelledTraces
-
-
-def add(window: TrainingWindow, *seqs: int) -> None:
-    for seq in seqs:
-        window.add(np.full((1, 3), float(seq), np.float32), seq % 2, 100 + seq, seq)
-
-
-def seqs_of(labelled: LabelledTraces) -> list[int]:
-    assert labelled.traces[:, 0, 0].tolist() == labelled.seq.tolist()
-    assert labelled.labels.tolist() == [seq % 2 for seq in labelled.seq]
-    assert labelled.hashes.tolist() == [100 + seq for seq in labelled.seq]
-    return labelled.seq.tolist()
 
 
 @settings(deadline=None)
@@ -29,8 +16,11 @@ def test_every_snapshot_is_of_the_newest_then_and_never_changes(capacity, steps)
     for n in steps:
         if n % 7 == 1:
             window.refill(window.snapshot())
-        add(window, *range(last + 1, last + n + 1))
+        for seq in range(last + 1, last + n + 1):
+            window.add(np.full((1, 3), float(seq), np.float32), seq % 2, 100 + seq, seq)
         last += n
         handed_out.append((window.snapshot(), list(range(max(0, last - capacity) + 1, last + 1))))
     for snapshot, expected in handed_out:
-        assert seqs_of(snapshot) == expected
+        assert snapshot.seq.tolist() == snapshot.traces[:, 0, 0].tolist() == expected
+        assert snapshot.labels.tolist() == [seq % 2 for seq in expected]
+        assert snapshot.hashes.tolist() == [100 + seq for seq in expected]
