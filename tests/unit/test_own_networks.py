@@ -235,4 +235,6 @@ def test_traces_too_small_for_their_unit_raise_an_alarm_that_says_so(reducer, am
     tiny = (amplitude * (np.abs(X) if amplitude < 0.0 else X)).astype(np.float32)
     engine = taught(reducer, traces=(tiny, y))
     alarm = engine.status().alarm
-    assert (engine.version, "the sensor" in alarm, "unit" in alarm) == (0, True, True)
+    assert engine.version == 0
+    assert "the sensor" in alarm
+    assert "unit" in alarm
