@@ -77,12 +77,13 @@ def _change_and_print(
 
     `change` returns a `Changed`, whose text is printed after the engine was closed, with the number
     of the event that records the change; the text may say that nothing changed. With `--json` a
-    document is printed instead, which also has the policy and the certificate (the bounds on the
-    shares of wrong decisions) after the change. `allow_import` permits to import the reducer (which
-    maps traces to points) or decision rule, module:Class, that the store names. The engine waits up
-    to 10 s for the disk or database. Raises the errors of `DataEngine.open` (StoreError if an
-    engine runs on the robot cell), those of `DataEngine.certificate`, and whatever `change` raises;
-    nothing is printed then. An error of `certificate` comes after the change, which stays.
+    document is printed instead, which also has the policy (the settings of decisions) and the
+    certificate (the bounds on the shares of wrong decisions) after the change. `allow_import`
+    permits to import the reducer (which maps traces to points) or decision rule, module:Class, that
+    the store names. The engine waits up to 10 s for the disk or database. Raises the errors of
+    `DataEngine.open` (StoreError if an engine runs on the robot cell), those of
+    `DataEngine.certificate`, and whatever `change` raises; nothing is printed then. An error of
+    `certificate` comes after the change, which stays.
     """
     from ..engine.engine import DataEngine
     from ..store.opening import LONG_WAIT

@@ -484,10 +484,11 @@ class MemberEvidence(nn.Module):
         time. The number supposes that their outcomes go on as they were since the alarm. It is 0 or
         less if they show recovery now, so that the side may open again. It is huge, of the order of
         1e12, while their evidence is not enough and not above 0. The evidence is the log capital of
-        a bet that the share of wrong members is below the tolerance; under the priced rule
-        (guarantee `cost`) it is what was saved minus what errors cost, and at least 25 members
-        since the alarm (`FEWEST_SINCE_ALARM`) are needed; under the watched rule (the paper's, with
-        a safe mode) it is the log likelihood ratio of the tolerance to its double. Nothing is
+        a bet that the share of wrong members is below the tolerance. Under the priced rule, which
+        decides by what checks and errors cost (guarantee `cost`), it is what was saved minus what
+        errors cost, and at least 25 members since the alarm (`FEWEST_SINCE_ALARM`) are needed.
+        Under the watched rule, whose threshold is fixed but for alarms (guarantee `local` with
+        stops="all"), it is the log likelihood ratio of the tolerance to its double. Nothing is
         changed.
         """
         counts: list[int] = self.member_counts_since_alarm[side].flatten().tolist()

@@ -470,7 +470,8 @@ class Corrections:
         and begins again later; labels that wait are stored, and what other robot cells stored is
         taken in. The decisions are in the order of the ids. `success` of a decision is None if its
         label was forgotten (withdrawn). Raises ReportError for an unknown id, and for a decision
-        that never had a label, and StoreError if the store does not answer or a trace is damaged.
+        that never had a label. Raises StoreError if the engine is closed, only reads or was opened
+        before a fork, if the store does not answer, and if a trace is damaged.
         """
         self._bring_up_to_date()
         decisions = []

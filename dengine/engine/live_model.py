@@ -372,13 +372,14 @@ class LiveModel:
 
         A policy has the settings of the decision rule, which turns the bounds of a success
         probability into an action. The two copies have one rule, made by `policy`, which has
-        learned nothing. It starts in the safe mode `evidence.began_in`: 0 is none; in any other
-        every part is verified until new outcomes allow decisions. The second copy is None before
-        the first retrain; it shares the references (the embedded labelled traces) of the model in
-        force, which decides now. If it cannot be made ready to predict, that is logged. A baseline
-        (a model that the user handed in), which has no such rule, is returned itself. Neither copy
-        is put in force. Raises what `Policy.rule` raises, such as SettingError if the rule cannot
-        be made.
+        learned nothing. `evidence` says from which version on decisions update the rule, and in
+        which safe mode it starts; only the latter, `began_in`, is used here: 0 is none; in any
+        other every part is verified until new outcomes allow decisions. The second copy is None
+        before the first retrain; it shares the references (the embedded labelled traces) of the
+        model in force, which decides now. If it cannot be made ready to predict, that is logged. A
+        baseline (a model that the user handed in), which has no such rule, is returned itself.
+        Neither copy is put in force. Raises what `Policy.rule` raises, such as SettingError if the
+        rule cannot be made.
         """
         template = self.template.with_policy(policy)
         template.reset_rule(evidence.began_in)

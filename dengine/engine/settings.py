@@ -541,8 +541,9 @@ class SettingsInForce:
         limit. If the store does not take the settings, or does not answer in time, the error is
         logged, and the attribute `is_unsaved` is set, which a later success clears; a commit that
         was too slow may still happen. Raises SettingError if another robot cell of the product
-        (cells that share labels) has settings that contradict these, or the recipe of one of the
-        two cannot be read; then nothing is written, and `is_unsaved` stays as it is.
+        (cells that share labels) has settings that contradict these, or the recipe (the settings
+        of an engine) of one of the two cannot be read; then nothing is written, and `is_unsaved`
+        stays as it is.
         """
         texts = self.now.to_store()
         try:

@@ -187,7 +187,9 @@ class TrainedOn:
 
         Without "pinned" this attribute is 0: the version (a trained model) is not one that a
         rollback put in use again. Arrays of other names are ignored. Raises KeyError without
-        "trained_on", "trained_as" or "counts_from".
+        "trained_on" (the numbers of the labels), "trained_as" (the number of the newest correction
+        of a label that they had) or "counts_from" (labels with larger numbers are new for the next
+        retrain).
         """
         return cls(
             state["trained_on"],
@@ -421,9 +423,9 @@ class Retrainer:
         """Log why a training failed, and return it as the reason of a dropped retrain.
 
         `error` is what the training, or waiting for it, raised; the reason begins with "dropped: ".
-        If the training is not done and its executor lives, it is discarded: it ends by itself, and
-        its result is lost. An executor that died, or in which a training hangs, is started again or
-        taken out of use (`_replace_executor`).
+        If the training is not done and its executor lives, it is discarded: its result is lost, and
+        it never begins, or goes on until it ends if it has begun. An executor that died, or in
+        which a training hangs, is started again or taken out of use (`_replace_executor`).
         """
         is_broken = isinstance(error, BrokenExecutor)
         training_raised = future.done() and not is_broken

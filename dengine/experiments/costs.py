@@ -620,11 +620,11 @@ def _finished(replays: Iterable[Replay], policies: Sequence[Policy]) -> Groups:
 
 
 def _check_search(data: Dataset, costs: Costs, repeats: int) -> None:
-    """Raise SettingError if no policy can be chosen.
+    """Raise SettingError if no policy, the settings of the rule that decides, can be chosen.
 
-    That is so for fewer than two repeats, a check that costs as much as an escape (a bad part that
-    is accepted) or more, a false reject that costs nothing, and recordings of parts that are all
-    good or all bad.
+    That is so for fewer than two repeats (random orders of the recordings that the last policies
+    play), a check that costs as much as an escape (a bad part that is accepted) or more, a false
+    reject that costs nothing, and recordings of parts that are all good or all bad.
     """
     expect(repeats >= 2, "2 or more repeats", repeats, "one says nothing of luck")
     expect(

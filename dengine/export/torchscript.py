@@ -129,8 +129,9 @@ def export_torchscript(
         `trace` has another shape than the model's traces, if the reducer (which maps traces to
         points), the confidence interval or the decision rule cannot be compiled, if the compiled
         decision and the reducer map one of up to eight labelled traces to different points, if the
-        rule is stale, because an update of it failed, if the store was changed from outside (its
-        rows do not fit their checksums), and if the key cannot be read or has fewer than 16 bytes.
+        embedding of a test trace is not finite (as for traces of one sample), if the rule is stale,
+        because an update of it failed, if the store was changed from outside (its rows do not fit
+        their checksums), and if the key cannot be read or has fewer than 16 bytes.
     SettingError
         If the engine's force limits do not fit `trace`.
     OutputError

@@ -85,9 +85,11 @@ def load_past_version(
     -------
     PastVersion or None
         The references with their labels (None for a label of another cell or a damaged one), the
-        thresholds of the rule, and how novel (unlike the training traces) the trace of the decision
-        was. None if no such version was put in force, if its stored arrays are damaged or no longer
-        kept, or if it has no references (a model that the user handed in).
+        thresholds of the rule (None if they are not kept), and how novel (unlike the training
+        traces) the trace of the decision was (None if the reason of the decision is another one, or
+        the limits are not kept). The result is None if no such version was put in force, if its
+        stored arrays are damaged or no longer kept, or if it has no references (a model that the
+        user handed in).
 
     Raises
     ------

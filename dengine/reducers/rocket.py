@@ -116,11 +116,12 @@ class FeatureEmbedding(nn.Module):
     def embed_features(self, f: Tensor) -> Tensor:
         """Embed traces, given by their scaled features f (B, P), in each of K spaces: (B, K, d).
 
-        There is an embedding space for each of K folds (fixed groups of traces). Classifier head k,
-        a logistic regression that is trained without the labels of fold k, gives the first
-        coordinate in space k: the probability of success, from 0 to 1. If d is 2, the second
-        coordinate is the sigmoid of a principal component of the features, scaled to 0 to 0.04; it
-        is the same in all spaces.
+        There is an embedding space for each of K folds (fixed groups of traces). The first
+        coordinate in space k is the probability of success, from 0 to 1, by classifier head k: the
+        sigmoid of a weighted mean of the logits of logistic regressions, trained without the labels
+        of fold k, on the features and on the products of every two leading principal components of
+        the first `Tower` (group of features). If d is 2, the second coordinate is the sigmoid of
+        the first of these components, scaled to 0 to 0.04; it is the same in all spaces.
         """
         columns = torch.addmm(self.bias, f, self.weight)
         products = pairwise_products(columns.narrow(1, self.n_scores, self.n_leading))
@@ -657,8 +658,8 @@ class RocketReducer(ProbabilityReducer):
         the module that embeds, is missing or has a size that does not follow from the parameters.
         Raises ValueError if a `Tower`, a group of features with its classifier heads, lacks an
         array, and KeyError if the shape, the counters (of fits, traces and steps) or the losses
-        (log loss of each space) are missing. The sizes of a tower's arrays are not checked. After
-        an error the fitted model may be lost.
+        (log loss of the heads of each fold) are missing. The sizes of a tower's arrays are not
+        checked. After an error the fitted model may be lost.
         """
         channels, samples = self.restore_shape(state)
         average, *counts = map(int, state["counts"])

@@ -273,8 +273,9 @@ class TorchReducer(ProbabilityReducer):
         sets `is_initialized_` to True. `average` is the number of samples that are averaged to one.
         Without `seed` the seed comes from `random_state`; torch's global generator keeps its state.
         Raises SettingError for a parameter out of its range, fewer than 2 samples, a `random_state`
-        of another type, or a network that cannot be used, like one that does not give (B,
-        features). The first two errors change nothing; after the others do not use the reducer.
+        that gives no seed (another type, or an integer below 0 or above 2**32 - 1), or a network
+        that cannot be used, like one that does not give (B, features). The first two errors change
+        nothing; after the others do not use the reducer.
         """
         self.check()
         if samples < 2:

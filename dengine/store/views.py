@@ -173,16 +173,17 @@ class Tally:
     def outcomes(self) -> Outcomes:
         """Counts of parts by action and corrected label, for a certificate (a bound on errors).
 
-        Accepted parts with the label good are `confirmed`, those with the label bad
-        `false_accepts`, those with the label forgotten (withdrawn) `forgotten_accepts`, and
-        rejected parts with the label good `false_rejects`. An audited part (checked, though the
+        `accepted` and `rejected` count all parts with this action, whatever the label. Accepted
+        parts with the label good are `confirmed`, those with the label bad `false_accepts`, those
+        with the label forgotten (withdrawn) `forgotten_accepts`, and rejected parts with the label
+        good `false_rejects`. An audited part (checked, though the
         model would have accepted or rejected it) is counted by what the model alone would have
         done, in the fields of audits alone and not among the accepted and rejected parts:
         `audited_accepts` and `audited_rejects` are the audits with the label good or bad,
         `audited_accepts_bad` and `audited_rejects_good` the wrong ones of these. Audits with the
         label forgotten or overdue (not reported in time) have fields of their own, and audits with
-        the label none are in no field. A part that an operator's limits rejected (`Reason.OUTSIDE`)
-        is not counted as rejected or false reject.
+        the label none (not reported) are in no field. A part that an operator's limits rejected
+        (`Reason.OUTSIDE`) is not counted as rejected or false reject.
         """
         actions = Counter[Action]()
         by_action = Counter[tuple[Action, str]]()

@@ -337,9 +337,10 @@ class RtdeStream:
     def _read_loop(self) -> None:
         """Receive packages and buffer them until the stream is closed: the body of the thread.
 
-        If the connection is lost, or its bytes are no RTDE (the protocol of the controller), it
-        reconnects, as often as that takes, and counts each new connection. While there is no
-        connection, the attribute `trouble` says why.
+        If the connection is lost or silent for the client's `timeout`, or a package cannot be used
+        (it is no RTDE, the protocol of the controller, lacks a column, or its time is not finite),
+        the thread reconnects, as often as that takes, and counts each new connection. While there
+        is no connection, the attribute `trouble` says why.
         """
         while self._client is not None:
             client = self._client

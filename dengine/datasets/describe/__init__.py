@@ -52,6 +52,7 @@ BAG = ".mcap"
 MOST_FILES = 60  # that are read
 MOST_ROWS = 50_000
 MOST_PIECES = 4  # of a part's curve, in files with numbers behind their names
+FEW = 5  # times as many files of another suffix make a suffix unlikely
 LEAST_PARTS = 10  # that have such pieces
 Names = Sequence[str]
 
@@ -121,14 +122,15 @@ def choose_files(p: Proposal, root: Path) -> bool:
     and the result is False. If it is True, `p.base` is the folder, `p.names` has these files, and
     `p.others` the other files with a suffix of recordings, like `.json` (`names_in`). `files`
     becomes patterns that match `p.names`, like `*.csv`, and `format` that of the first file's
-    suffix, `text` for an unknown one. `exclude`, the patterns of files that are no recordings, is
-    not looked at. Raises DataError if there is no file of recordings, a stated pattern is
+    suffix, `text` for an unknown one. Files that the stated patterns `exclude` match are among the
+    others. Raises DataError if there is no file of recordings, a stated pattern is
     malformed, or, without stated patterns, all likely endings are of formats that dengine does not
     read (`FOREIGN`).
     """
     stated = p.description.files
     every = names_in(root, ())
-    names = names_in(root, stated)
+    excluded = match_files(root, p.description.exclude)
+    names = [name for name in names_in(root, stated) if name not in excluded]
     if not names:
         raise DataError(f"Expected files of recordings, {listed(SUFFIXES)}, in {root}, got none.")
     endings = likely_endings(names)
@@ -153,8 +155,9 @@ def choose_files(p: Proposal, root: Path) -> bool:
 def likely_endings(names: Names) -> Names:
     """Return the endings of these file names of which one may tell recordings from other files.
 
-    They are the suffixes that several files have, and `.mcap` even if only one file has it; if
-    there are none of these, all suffixes. If there is only one, and the files are one for each part
+    They are the suffixes that more than a fifth as many files have as the most frequent one, and
+    `.mcap` even if only one file has it. Those that dengine does not read (`FOREIGN`) count only if
+    more files have them than any other. If there is only one, and the files are one for each part
     and signal, like `1_Kraft.csv` and `1_Weg.csv`, the endings of the signals, `Kraft.csv` and
     `Weg.csv`, come before it. Such an ending is what stands behind the last `-`, `_` or blank of a
     name, and the part is what stands before. There must be at least two parts and two such endings,
@@ -163,7 +166,13 @@ def likely_endings(names: Names) -> Names:
     more: they are then numbered pieces of a part's curve.
     """
     counts = Counter(map(suffix_of, names))
-    likely = [suffix for suffix, n in counts.items() if n > 1 or suffix == BAG] or [*counts]
+    most = max(counts.values())
+    readable = max(counts[suffix] for suffix in SUFFIXES)
+    likely = [
+        suffix
+        for suffix, n in counts.items()
+        if (n * FEW > most and (suffix in SUFFIXES or n > readable)) or suffix == BAG
+    ]
     words = [re.split(r"[-_ ](?=[^-_ /]+$)", name) for name in names]
     n_parts = len({name[0] for name in words})
     endings = sorted({name[-1] for name in words})

@@ -22,10 +22,13 @@ from ..table import Cells, Table
 from ..units import bare, unit_in
 
 DAY = "%Y-%m-%d"
-DAYS = ("%d.%m.%Y", "%Y/%m/%d", "%m/%d/%Y", "%d/%m/%Y", "%d.%m.%y", "%d-%b-%y", "%d-%b-%Y")
+DAYS = (
+    *("%d.%m.%Y", "%Y/%m/%d", "%m/%d/%Y", "%d/%m/%Y", "%d-%m-%Y", "%m-%d-%Y"),
+    *("%d.%m.%y", "%d-%b-%y", "%d-%b-%Y"),
+)
 TIMES = (
     *("%H:%M:%S.%f", "%H:%M:%S", "%H:%M:%S:%f", "%H:%M"),
-    *("%I:%M:%S.%f %p", "%I:%M:%S %p"),
+    *("%I:%M:%S.%f %p", "%I:%M:%S %p", "%I:%M %p"),
 )
 FORMS = (
     *(DAY, ISO, *DAYS, *TIMES, "%M:%S.%f", "%Y-%m-%d %H:%M:%S.%f UTC", "%Y-%m-%d %H:%M:%S.%f"),

@@ -73,10 +73,11 @@ def with_meanings(source: LabelSource, words: Names) -> LabelSource:
     A list that the source has already stays; the others get the words of known meaning, like "ok",
     in any case of letters. Then `good` or `bad` becomes `?` if it would be empty: that all files
     say `OK` proves nothing. True, yes or 1 and their opposites, alone or with words for unchecked
-    (not labelled yet), have known meanings only if the name of the column, line or topic is one for
-    good, like `success`, not `failed`; in a path whose expression has `([^`, as in `([^/]+)/`, they
-    have none. Beside other words, and in every other path, true means good and false bad, whatever
-    the name is; yes, 1 and their opposites have no known meaning there.
+    (not labelled yet), have known meanings only if the name of the column, line or topic (a named
+    series of messages in a ROS bag) is one for good, like `success`, not `failed`; in a path whose
+    expression has `([^`, as in `([^/]+)/`, they have none. Beside other words, and in every other
+    path, true means good and false bad, whatever the name is; yes, 1 and their opposites have no
+    known meaning there.
     """
     words = sorted({*words})
     name = (
@@ -150,13 +151,16 @@ def may_be_labels(source: LabelSource, words: Names) -> bool:
 
 
 def lines_of(p: Proposal) -> list[str]:
-    """Return how the lines above the header begin, up to the first `; : = , tab` or two blanks.
+    """Return how the lines above the header begin, up to the first mark, two blanks or a date.
 
-    `p` is the description so far, and only the first table of its recordings is looked at. Comment
-    marks and quotes before it are left out. Each beginning comes once; empty ones are left out.
+    The marks are `; : = ,` and the tab. `p` is the description so far, and only the first table of
+    its recordings is looked at. Comment marks and quotes before it are left out. Each beginning
+    comes once; empty ones are left out.
     """
     beginnings = [
-        re.split(r"[;:：=\t,]|  ", line.lstrip("#%* \t\"'"))[0].strip(" \"'")
+        re.split(r"[;:：=\t,]|  |(?<=[^\W\d]) (?=\d+[-./]\d+[-./]\d)", line.lstrip("#%* \t\"'"))[
+            0
+        ].strip(" \"'")
         for table in p.tables[:1]
         for line in table.above
     ]

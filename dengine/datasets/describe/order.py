@@ -4,74 +4,82 @@ import re
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from itertools import zip_longest
+from itertools import groupby, pairwise, zip_longest
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
 
 from ...errors import DataError, listed
 from ..description import UNKNOWN, Clock, LabelSource, TextForm
-from ..read.clock import times_of
-from ..read.files import HALF_DAY, natural_key
-from ..read.places import listing_table, without_label, without_suffix
+from ..read.clock import has_day, times_of
+from ..read.files import DATE, HALF_DAY, UNSORTED, natural_key, sort_key
+from ..read.places import listing_table, stem_of
 from ..table import Table
-from .columns import Column, Proposal
-from .labels import WORD, lines_of, part_words, tables_of, words_of
+from .columns import Column, Proposal, Tables
+from .labels import lines_of, part_words, tables_of, words_of
 
-STAMP_NAME = re.compile(r"(?i)stamp|stempel|created|date|datum|epoch")
-DATE_IN_PATH = (  # with the year in front
-    r"(?<![\d.])((?:19|20)\d\d(?:-[01]\d-|_[01]\d_|\.[01]\d\.|[01]\d)[0-3]\d(?!\d{7})[^/]*)$"
+STAMP_NAME = re.compile(r"(?i)stamp|created|date|datum|epoch")
+STAMP_WORD = re.compile(r"(.*\d){5}")
+EPOCH = re.compile(r"(1\d|2[0-4])\d{8}(\d{3}){0,3}(\.\d*)?")  # s, ms, us or ns since 1970
+YEAR = re.compile(r"20[0-4]\d([01]\d[0-3]\d((\d\d){1,3})?)?")  # with month, day and time of day
+MARK = re.compile(r"[-_. :T/]?")  # between the numbers of a date
+# Numbers of a date with the day or the month first, like 010324 and the time of day.
+DAY_FIRST = re.compile(
+    r"[0-3]?\d[0-3]\d(20)?[0-4]\d[0-2]\d[0-5]\d([0-5]\d)?|[0-3]?\d[0-3]\d20[0-4]\d"
 )
-YEAR = re.compile(r"20[0-4]\d((\d\d){2,5})?")  # with month and day, and with the time of day
-VERDICT_FOLDER = re.compile(rf"(?i)(?<![^/])({WORD})/")
+FRONT = "a number, or year, month and day in front"
+FEW = 0.15  # of the times of day that may be smaller than the one before, on the next day
 
 
 def propose_order(p: Proposal) -> None:
-    """Set `order` in `p` to what is certain: `name`, `path` if labels stand first in names, or `?`.
+    """Set `order` in `p` to what is certain: `name`, `path`, or else `?`, with a note.
 
-    `p` is the description so far; `name` means by file name, and `path` folder by folder, without
-    the text that is the label. It is `?`, with a note, if the files, folder by folder, have another
-    order than their names, or if the names do not count the parts: they do not differ first in a
-    number or date (`counts_parts`). The text of `label.path` and folders named like a verdict do
-    not count; while `label.column` is `?`, names are not looked at. It is `?`, too, if the part
-    numbers, or the columns' names where each column is a part, fall or are sorted as texts (P10
-    before P2), or if a date or time of each recording does not rise (`falling_stamps`). If several
-    of these hold, the note is on the last. An `order` that the user stated stays. Raises
-    SettingError for a malformed `windows.trigger`, the condition at which long recordings are cut.
+    `p` is the description so far. `name` means by file name, and `path` folder by folder, without
+    words that are labels. An order is certain if the names or paths in it, both without such words,
+    prove it (`counts_parts`); if both do, it must be the same. In the layout `columns` the columns'
+    names count in place of files, as they stand. While `label.column` is `?`, names are not looked
+    at.
+
+    `order` is also `?` if the part numbers fall, are sorted as texts (P10 before P2) or are
+    counters that do not rise, or if a date, time or counter of each recording does not rise
+    (`falling_stamps`). If several of these hold, the note is on the last. An `order` that the user
+    stated stays. Raises SettingError for a malformed `windows.trigger`, the condition at which long
+    recordings are cut.
     """
-    label = p.description.label
-    # A folder of a verdict is no step of the production, even if the label stands elsewhere.
-    paths = {
-        name: VERDICT_FOLDER.sub("", without_label(label, without_suffix(name))) for name in p.names
-    }
-    files = sorted(paths, key=lambda name: natural_key(_last(paths[name])))
-    # While it is open where the label stands, any folder or word may be one of a verdict.
-    if label.column != UNKNOWN:
-        names = [_last(paths[name]) for name in files]
-        if files != sorted(paths, key=lambda name: natural_key(_last(name))):
-            p.put("order", "path")
-        by_folder = sorted(paths, key=lambda name: natural_key(paths[name]))
-        if files != by_folder or not counts_parts(names):
-            p.put(
-                "order",
-                UNKNOWN,
-                f"name: by file name, or path: folder by folder; {listed(names[:3])} prove neither."
-                " If both are wrong, rename the files: a number, or year, month and day in front",
-            )
+    about = p.description
     tables = tables_of(p)
-    tables.sort(key=lambda table: natural_key(_last(paths.get(table.path, ""))))
-    words = part_words(p.description.part, tables)
-    if p.description.layout == "columns":
-        words = {table.source: table.path for table in tables}
-    numbers = [*words.values()]
+    stems = {table.path: stem_of(about, table.path) for table in tables}
+    names = {path: f"{_last(stem)} {stem}" for path, stem in stems.items()}  # then the folders
+    by_name = [*stems]
+    if about.layout != "columns":
+        by_name.sort(key=lambda path: natural_key(_last(path)))
+    by_path = sorted(stems, key=lambda path: natural_key(stems[path]))
+    proved = {
+        order: files
+        for order, files, texts in (("name", by_name, names), ("path", by_path, stems))
+        if counts_parts([texts[path] for path in files])
+    }
+    files = [*proved.values(), by_name][0]
+    # While it is open where the label stands, any folder or word may be one of a verdict.
+    if about.label.column != UNKNOWN:
+        if proved and all(other == files for other in proved.values()):
+            p.put("order", next(iter(proved)))
+        else:
+            text = f"name: by file name, or path: folder by folder; {listed(by_name[:3])} prove"
+            p.put("order", UNKNOWN, f"{text} neither. If both are wrong, rename the files: {FRONT}")
+    places = {path: place for place, path in enumerate(files)}
+    tables.sort(key=lambda table: places[table.path])
+    numbers = [*part_words(p.description.part, tables).values()]
     rising = sorted(numbers, key=natural_key)
-    if numbers != rising and numbers in (sorted(numbers), rising[::-1]):
+    is_odd = numbers in (sorted(numbers), rising[::-1]) or counter_of(numbers)
+    if numbers != rising and is_odd:
         name = listed(p.description.part.column) or "path"
-        p.put("order", UNKNOWN, f"name, or {name}: the part numbers fall or are sorted as texts")
+        p.put("order", UNKNOWN, f"name, or {name}: the part numbers have another order")
     for source in falling_stamps(p, tables):
-        place = source.column or source.line or "the file names"
-        other = "rename the files" if source.listing or not source.column else place
-        p.put("order", UNKNOWN, f"name, or {other}: the dates in {place} have another order")
+        place = source.column or source.line
+        other = place if source.column and not source.listing else "rename the files"
+        p.put("order", UNKNOWN, f"name, or {other}: {place} has another order")
 
 
 def _last(path: str) -> str:
@@ -80,53 +88,98 @@ def _last(path: str) -> str:
 
 
 def counts_parts(names: Sequence[str]) -> bool:
-    """Return whether sorted names prove an order, by what they differ in first.
+    """Return whether names in their order prove that the parts were made in this order.
 
-    The order is that in which the parts were made. What differs must be a number in every name, and
-    either another one in each, or a year or a part of a date or time behind it. Different names
-    with AM or PM prove nothing. Numbers that repeat may be of a program or a station, and words
-    sort before numbers. Equal names prove it, too.
+    What they differ in first must belong to a date with the year in front, or be a number, another
+    one in each name. The date goes on with numbers behind marks, like the time of day, and must not
+    fall; names of one date must prove their order, too. Beside a number in front no other number
+    may fall that each name has, another one in each. Numbers with the day first (010324080000) and
+    names with AM or PM prove nothing. If all names are equal, no other order is possible.
     """
+    if len({*names}) == 1:
+        return True
     pieces = [*zip_longest(*map(natural_key, names), fillvalue="")]
-    for i, row in enumerate(pieces):
-        if len({*row}) > 1:
-            years = [all(YEAR.fullmatch(str(n)) for n in row) for row in pieces[1 : i + 1 : 2]]
-            is_counter = any(years) or len({*row}) == len(names)
-            return i % 2 == 1 and "" not in row and is_counter and not HALF_DAY.search(str(names))
-    return True
+    n = len(pieces)
+    begin = end = next((i for i in range(1, n, 2) if fits_all(YEAR, pieces[i])), n)
+    while end + 2 < n and "" not in pieces[end + 2] and fits_all(MARK, pieces[end + 1]):
+        end += 2
+    dates = [*zip(*pieces[begin : end + 1 : 2], strict=True)]
+    if dates != sorted(dates) or any(map(HALF_DAY.search, names)):
+        return False
+    first = next(i for i, row in enumerate(pieces) if len({*row}) > 1)
+    if begin <= first <= end:
+        days = groupby(zip(dates, names, strict=True), itemgetter(0))
+        return all(counts_parts([name for _, name in day]) for _, day in days)
+    numbers = pieces[1:begin:2] + pieces[end + 2 :: 2]
+    counters = [row for row in numbers if "" not in row and len({*row}) == len(names)]
+    is_odd = any([*row] != sorted(row) or fits_all(DAY_FIRST, row) for row in counters)
+    return pieces[first] in counters and not is_odd
 
 
-def falling_stamps(p: Proposal, tables: Sequence[Table]) -> Iterator[LabelSource]:
-    """Yield each place with a date or time for each recording, by which these are out of order.
+def fits_all(pattern: re.Pattern[str], pieces: Sequence[Any]) -> bool:
+    """Return whether a regular expression matches each text or number as a whole."""
+    return all(map(pattern.fullmatch, map(str, pieces)))
 
-    The places are the file names, if they have dates with the year in front; columns without
-    another use that have one word in all rows of a recording; lines above the header of the first
-    table; and columns of listings of labels. A column or line counts if its words are dates or
-    times of a known form (`Column.forms`), or if its name says so (`timestamp`, `created`); then
-    they are sorted as texts, numbers in them by their size (`natural_key`). Equal ones are in
-    order, and if several forms fit, one in which they are in order is enough. `p` is the
-    description so far. Raises SettingError for a malformed `windows.trigger`, the condition at
-    which a part begins.
+
+def counter_of(words: Sequence[str]) -> list[int]:
+    """Return the first number in each word that counts them; empty if none does.
+
+    Each word must have it, another one in each, and they must be close: the largest is less than
+    twice as many above the smallest as there are words. There must be three words or more.
+    """
+    for row in [*zip_longest(*map(natural_key, words), fillvalue="")][1::2]:
+        if len(words) > 2 and "" not in row and len({*row}) == len(words):
+            return [*row] if max(row) - min(row) < 2 * len(words) else []
+    return []
+
+
+def falling_stamps(p: Proposal, tables: Tables) -> Iterator[LabelSource]:
+    """Yield each place with a date, time or counter for each recording, that is out of order.
+
+    The places are the first words of columns without another use, lines above the header of the
+    first table, and columns of listings of labels. A place counts if its words are dates or times
+    of a known form (`Column.forms`) or numbers of seconds since 1970 (or ms, us, ns), if its name
+    says so (`timestamp`, `created`) and its words have five digits or more, or if it has one word
+    for each recording, and a number in them counts the recordings (`counter_of`). Equal ones are in
+    order, and if several forms fit, one in which they are in order is enough. Times of day without
+    a date may begin again. Empty words are left out. `p` is the description so far. Raises
+    SettingError for a malformed `windows.trigger`, the condition at which a part begins.
 
     tables : the table of each recording, in the order to be compared.
     """
     parts = part_words(p.description.part, tables)
-    sources = [LabelSource(path=DATE_IN_PATH)]
-    sources += [LabelSource(column=column.name) for column in p.unused if column.fixed]
+    sources = [LabelSource(column=column.name, at="first") for column in p.unused]
     sources += [LabelSource(line=line) for line in lines_of(p)]
     for label in p.description.labels:
         with suppress(DataError):
             listing = listing_table(p.base / label.listing, p.description.text)
             sources += [replace(label, column=name) for name in listing.columns]
     for source in sources:
-        words = [*words_of(p, source, tables, parts).values()]
-        cells = Table("", {"": np.array(words, dtype=object)}, [])
-        forms = Column("", [cells], TextForm()).forms if words else []
-        ranks: list[Any] = []
-        for form in forms:
-            with suppress(DataError):  # a word far behind may be no time
-                ranks.append(times_of(cells, Clock(("",), (form,)), TextForm()).tolist())
-        if source.path or STAMP_NAME.search(source.column or source.line):
-            ranks = ranks or [[*map(natural_key, words)]]
-        if ranks and not any(rank == sorted(rank) for rank in ranks):
+        words = [*filter(None, words_of(p, source, tables, parts).values())]
+        is_fixed = source.listing or source.line or p.columns[source.column].fixed
+        ranks = [*stamps_of(words, STAMP_NAME.search(source.column or source.line) is not None)]
+        if is_fixed and not ranks and (counter := counter_of(words)):
+            ranks = [counter]
+        if ranks and all(rank != sorted(rank) for rank in ranks):
             yield source
+
+
+def stamps_of(words: Sequence[str], is_named: bool) -> Iterator[list[Any]]:
+    """Yield what words are sorted by if they are dates or times, for each form that fits.
+
+    Nothing is yielded for other words. Times of day of which few are smaller than the one before
+    are sorted already.
+
+    is_named : whether the place of the words is named like a date or time.
+    """
+    cells = Table("", {"": np.array(words, dtype=object)}, [])
+    forms = Column("", [cells], TextForm()).forms if words else []
+    for form in forms:
+        with suppress(DataError):  # a word far behind may be no time
+            times = times_of(cells, Clock(("",), (form,)), TextForm()).tolist()
+            n_falls = sum(a > b for a, b in pairwise(times))
+            yield times if has_day(form) or n_falls > FEW * len(times) else []
+    is_plain = is_named and not any(UNSORTED.search(DATE.sub("", word)) for word in words)
+    is_stamp = is_plain or all(map(EPOCH.fullmatch, words))
+    if is_stamp and not forms and all(map(STAMP_WORD.match, words)):
+        yield [*map(sort_key, words)]

@@ -16,6 +16,7 @@ from ..table import UnreadableError
 
 GZIP = ".gz"
 DATE = re.compile(r"(?<![0-9])([0-9]{1,2})\.([0-9]{1,2})\.([0-9]{4})(?![0-9])")
+DECIMAL = re.compile(r"[0-9]+(\.[0-9]*)?([eE]\+?[0-9]+)?")
 HALF_DAY = re.compile(r"\d ?[aApP][mM](?![A-Za-z])")
 # Dates and times that are in another order than the numbers in them.
 UNSORTED = re.compile(
@@ -33,6 +34,11 @@ def natural_key(text: str) -> list[Any]:
     pieces: list[Any] = re.split(r"([0-9]+)", DATE.sub(r"\3.\2.\1", text))
     pieces[1::2] = map(int, pieces[1::2])  # texts and numbers take turns
     return pieces
+
+
+def sort_key(word: str) -> list[Any]:
+    """Return a key that sorts decimal numbers by their value, and other words as `natural_key`."""
+    return ["", float(word), ""] if DECIMAL.fullmatch(word) else natural_key(word)
 
 
 def as_source(source: Any) -> Any:

@@ -71,8 +71,8 @@ def columns_of(prefix: str, value: Any) -> Columns:
     `{"name": "force", "data": [...]}`, one for each name and key (see `_turned`). An array or list
     of lists (C, n) with C <= n, or (n, C) with C < n, has a column for each of its C channels.
     Nested values are treated in the same way; an empty list is a column without cells, an empty
-    mapping none. Raises UnreadableError if the items of a list whose first item is a list or
-    mapping are not all alike.
+    mapping none. Raises UnreadableError if a list whose first item is a list or mapping has an item
+    of another kind, a mapping without a key of the first, or lists of different lengths.
 
     prefix : the name of the value; a dot and the key, or the channel from 0, are appended. Without
     a name, "", a column is called by the key alone.

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from ...errors import DataError, instead, listed, shortened
 from ..dataset import Fault
-from ..description import LabelSource, PartSource, TextForm
+from ..description import Description, LabelSource, PartSource, TextForm
 from ..table import Table, UnreadableError
 from .files import natural_key, read_file
 from .frames import read_parquet
@@ -28,7 +28,20 @@ def without_label(source: LabelSource, path: str) -> str:
     Without a match, or if `source.path` is "", it is the whole path. Raises re.error if that is no
     regular expression, and IndexError if it matches but has no group.
     """
-    return re.sub(source.path or "$^", lambda match: match[0].replace(match[1] or "", "", 1), path)
+    return re.sub(
+        source.path or "(?!)", lambda match: match[0].replace(match[1] or "", "", 1), path
+    )
+
+
+def stem_of(description: Description, path: str) -> str:
+    """Return a path without its suffix, and without the words in it that are labels or checks.
+
+    Raises re.error and IndexError as `without_label` does.
+    """
+    path = without_suffix(path)
+    for source in description.labels:
+        path = without_label(source, path)
+    return path
 
 
 def without_suffix(path: str) -> str:

@@ -22,9 +22,9 @@ from ..table import Recording, Table, UnreadableError, as_word
 from ..units import bare, conversion, unit_in
 from .bags import read_bag
 from .clock import check_steps, times_of
-from .files import DATE, UNSORTED, caught, find_files, natural_key, read_file
+from .files import DATE, UNSORTED, caught, find_files, natural_key, read_file, sort_key
 from .frames import read_frame
-from .places import LabelReader, part_of, read_labels, without_label, without_suffix
+from .places import LabelReader, part_of, read_labels, stem_of
 from .split import split, table_of
 from .windows import cut
 
@@ -93,9 +93,9 @@ def recording_of(
     if label is None:
         return None
     if order == "path":
-        rank = natural_key(without_label(description.label, without_suffix(table.path)))
+        rank = natural_key(stem_of(description, table.path))
     elif order not in ORDERS:
-        rank = natural_key(word := table.one_word(order, "first"))
+        rank = sort_key(word := table.one_word(order, "first"))
         is_unsorted = UNSORTED.search(DATE.sub("", word)) is not None
         table.refuse(np.array([is_unsorted]), "dates to sort by, with the year in front", order)
     return Recording(
