@@ -124,7 +124,7 @@ def choose_files(p: Proposal, root: Path) -> bool:
     becomes patterns that match `p.names`, like `*.csv`, and `format` that of the first file's
     suffix, `text` for an unknown one. Files that the stated patterns `exclude` match are among the
     others. Raises DataError if there is no file of recordings, a stated pattern is
-    malformed, or, without stated patterns, all likely endings are of formats that dengine does not
+    malformed, or, without stated patterns, a likely ending is of a format that dengine does not
     read (`FOREIGN`).
     """
     stated = p.description.files
@@ -135,10 +135,10 @@ def choose_files(p: Proposal, root: Path) -> bool:
         raise DataError(f"Expected files of recordings, {listed(SUFFIXES)}, in {root}, got none.")
     endings = likely_endings(names)
     expect_data(
-        bool(stated or {*endings} - {*FOREIGN}),
+        bool(stated) or {*endings}.isdisjoint(FOREIGN),
         f"files that dengine reads in {root}",
         endings,
-        "see the page 'Recordings that dengine does not read'",
+        "state files, or see the page 'Recordings that dengine does not read'",
     )
     if len(endings) > 1 and not stated:
         p.put("files", UNKNOWN, f"one of {listed(f'**/*{ending}' for ending in endings)}")
