@@ -293,8 +293,8 @@ class Description:
         `columns`: a column for each part. `npz`: arrays with all parts. `mcap`: bags.
     order
         The order in which the parts were made. `name`: by file name, with the numbers in it sorted
-        by value, and dates like 31.12.2025 by year. `path`: folder by folder, apart from the words
-        of `label.path`, and by name within a folder. `time`: by the first time of each recording.
+        by value, and dates like 31.12.2025 by year. `path`: folder by folder, and by name within a
+        folder, apart from the words of `label.path` and of the paths of checks. `time`: by the first time of each recording.
         Or the name of a column.
     """
 

@@ -18,7 +18,7 @@ PART_NAME = re.compile(
     r"(?i)part(?!ition)|serial|serien|matricola|episode|teil(?!schritt|enummer|e?typ)"
     r"|werkst(?!.*tr(ä|ae?)ger)|barcode|dmc|trial|piece"
     r"|sample_?id"
-    r"|^(id|run|sn|cycle|shot|nr|no)$|cycle.?(no|nr|id)$"
+    r"|^(id|run|sn|cycle|shot|nr|no|dut|uut|workpiece|pr(ü|ue)fling)$|cycle.?(no|nr|id)$"
     r"|(?<!order)(?<!batch)(?<!shift)(?<!lot)_(id|run|cycle|sn|nr)$"
 )
 NUMBER = re.compile(r"\d+(\.\d+)?(e-?\d+)?(?=[\])]?( ?[\[(][^\d\[(]+[\])])?$)")  # as in `F_0.5 [N]`

@@ -21,7 +21,10 @@ from .labels import lines_of, part_words, tables_of, words_of
 
 STAMP_NAME = re.compile(r"(?i)stamp|created|date|datum|epoch")
 STAMP_WORD = re.compile(r"(.*\d){5}")
-EPOCH = re.compile(r"(1\d|2[0-4])\d{8}(\d{3}){0,3}(\.\d*)?")  # s, ms, us or ns since 1970
+# In s, ms, us or ns since 1970, or like 20240131_235959.
+STAMP = re.compile(
+    r"(1\d|2[0-4])\d{8}(\d{3}){0,3}(\.\d*)?|20[0-4]\d[01]\d[0-3]\d[T_ -]?\d{4}(\d\d)?"
+)
 YEAR = re.compile(r"20[0-4]\d([01]\d[0-3]\d((\d\d){1,3})?)?")  # with month, day and time of day
 MARK = re.compile(r"[-_. :T/]?")  # between the numbers of a date
 # Numbers of a date with the day or the month first, like 010324 and the time of day.
@@ -180,6 +183,6 @@ def stamps_of(words: Sequence[str], is_named: bool) -> Iterator[list[Any]]:
             n_falls = sum(a > b for a, b in pairwise(times))
             yield times if has_day(form) or n_falls > FEW * len(times) else []
     is_plain = is_named and not any(UNSORTED.search(DATE.sub("", word)) for word in words)
-    is_stamp = is_plain or all(map(EPOCH.fullmatch, words))
+    is_stamp = is_plain or all(map(STAMP.fullmatch, words))
     if is_stamp and not forms and all(map(STAMP_WORD.match, words)):
         yield [*map(sort_key, words)]
