@@ -294,8 +294,8 @@ class Description:
     order
         The order in which the parts were made. `name`: by file name, with the numbers in it sorted
         by value, and dates like 31.12.2025 by year. `path`: folder by folder, and by name within a
-        folder, apart from the words of `label.path` and of the paths of checks. `time`: by the first time of each recording.
-        Or the name of a column.
+        folder, apart from the words of `label.path` and of the paths of checks. `time`: by the
+        first time of each recording. Or the name of a column.
     """
 
     version: int = VERSION
