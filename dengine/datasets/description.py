@@ -441,15 +441,17 @@ class Description:
     def with_values(self, stated: Stated) -> "Description":
         """Return a description in which the given keys, like `label.column`, have these values.
 
-        The keys `column`, `path`, `line`, `topic` and `listing` in `[label]` each say where the
-        label stands: stating one clears the others, and likewise with `column`, `path` and `line`
-        in `[part]`; words for good and bad stay. Stating a channel replaces the channel `?`. In
-        `rows.NAME.keep`, `channels.NAME.unit` and keys like these (that end in drop, invalid,
-        factor or limit) the name of a column may have dots; any other key is split at its first
-        dot. A key without a dot may be a whole section, which its value then replaces. The notes
-        stay. Raises DataError for an unknown key or a wrong value, as `from_dict` does, if what
-        stands before the dot in a key is no section, and for a key like `check.column` if there is
-        a `[[check]]` (a source that must agree with the label) already.
+        The keys `column`, `path`, `line`, `topic` and `listing` (a file with a row for each
+        recording or part) in `[label]` say where the label stands: stating one or more clears the
+        others, also the `column` of a listing; likewise with `column`, `path` and `line` in
+        `[part]`. Words for good and bad stay. Stating a channel replaces the channel `?`, which
+        stands there while none is known. In `rows.NAME.keep`, `channels.NAME.unit` and keys like
+        these (that end in drop, invalid, factor or limit) the name of a column may have dots; any
+        other key is split at its first dot. A key without a dot may be a whole section, which its
+        value then replaces. The notes stay. Raises DataError for an unknown key or a wrong value,
+        as `from_dict` does, if what stands before the dot in a key is no section, and for a key
+        like `check.column` if there is a `[[check]]` (a source that must agree with the label)
+        already.
         """
         values = self.to_dict()
         for section in ("label", "part"):

@@ -351,10 +351,10 @@ class MemberEvidence(nn.Module):
         `inclusion_probability`, with which its outcome would be asked for, says how: 1 as checked,
         above 0 as audited (drawn at random), which is counted apart, and 0 not at all. Each level
         that the score reaches counts the part, and keeps whether it was wrong among its newest 50.
-        The counts of members (the parts that the rule's promise is about) get the part, too, if its
-        score reaches the target, or if `predicted`, the `ActionCode` of what the model alone would
-        have done, is the action of this side. No threshold is chosen if the part is counted
-        nowhere.
+        The counts of members (the parts over which the rule bounds the share or cost of errors) get
+        the part, too, if its score reaches the target, or if `predicted`, the `ActionCode` of what
+        the model alone would have done, is the action of this side. No threshold is chosen if
+        neither a level nor the members count the part.
         """
         if score >= float(self.thresholds[side].item()):
             self.step_detector(side, self.error_steps[side] if wrong else self.correct_step, 1)

@@ -818,10 +818,11 @@ class DataEngine(AbstractContextManager["DataEngine"]):
             that is not done is discarded. With an executor the first such call also loads the
             modules that a retrain imports; if that fails, it is logged. False: begin to retrain in
             the executor, and return None; `poll` brings it to its end. If a retrain is under way, a
-            trained version is first taken one step further (in a product, all steps), and another
-            retrain is begun only if that was the last step. If the executor cannot begin yet,
-            `poll` or `report` begins it. Without an executor, or if the executor takes no work
-            because it died or hangs, the retrain runs in this thread, and its report is returned.
+            trained version is first taken one step further (in a product, all steps): from the
+            executor, then through its test and the store into force. Another retrain is begun only
+            if none is under way then. If the executor cannot begin yet, `poll` or `report` begins
+            it. Without an executor, or if the executor takes no work because it died or hangs, the
+            retrain runs in this thread, and its report is returned.
 
         Returns
         -------

@@ -536,10 +536,10 @@ class Database:
     def acquire_lease(self) -> None:
         """Lock the robot cell on a PostgreSQL server; write from now on through that connection.
 
-        Only one engine has the lock of a cell (the lease). It lasts as long as the connection; if
-        that is lost, the next connection locks again, and if another engine has the lock by then,
-        `write` raises StoreError. Raise StoreError if another engine has the lock now, or the
-        database fails; this `Database` can then still be used, without it.
+        Only one `DataEngine` at a time has the lock of a cell (the lease). It lasts as long as the
+        connection; if that is lost, the next connection locks again, and if another engine has the
+        lock by then, `write` raises StoreError. Raise StoreError if another engine has the lock
+        now, or the database fails; this `Database` can then still be used, without it.
         """
         # The name is shown to an engine that finds the cell locked.
         self._writer = sa.create_engine(
@@ -644,7 +644,7 @@ class Database:
 
         If another thread is writing: with `waiting` this waits until it has finished; without, it
         returns at once, and that thread disconnects when it has finished. SQLite in memory is lost.
-        What the engine has recorded but not written yet is not written. A second call changes
+        What a `DataEngine` has recorded but not written yet is not written. A second call changes
         nothing.
         """
         self._closed = True

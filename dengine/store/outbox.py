@@ -73,7 +73,7 @@ class Outbox(ABC):
         return os.getpid() == self._pid and not self._closed
 
     def check_usable(self) -> None:
-        """Raise a StoreError if the engine is closed, only reads, or was opened before a fork.
+        """Raise StoreError if the `DataEngine` is closed, only reads, or was opened before a fork.
 
         To use what was opened before a fork is an error only in the child process. Faults of the
         store, and rows that are not as they were written (`integrity_error`), are not raised.

@@ -93,11 +93,12 @@ def _last(path: str) -> str:
 def counts_parts(names: Sequence[str]) -> bool:
     """Return whether names in their order prove that the parts were made in this order.
 
-    What they differ in first must belong to a date with the year in front, or be a number, another
-    one in each name. The date goes on with numbers behind marks, like the time of day, and must not
-    fall; names of one date must prove their order, too. Beside a number in front no other number
-    may fall that each name has, another one in each. Numbers with the day first (010324080000) and
-    names with AM or PM prove nothing. If all names are equal, no other order is possible.
+    What they differ in first must belong to a date that begins with the year, or be a number,
+    another one in each name. A date goes on with numbers behind marks, like the time of day. It
+    must not fall in either case. If they differ in it first, names of one date must prove their
+    order, too. If they differ in a number first, this number must rise, and so must any other that
+    each name has, another one in each. Numbers with the day first (010324080000) and names with AM
+    or PM prove nothing. If all names are equal, no other order is possible: True.
     """
     if len({*names}) == 1:
         return True
@@ -139,11 +140,12 @@ def counter_of(words: Sequence[str]) -> list[int]:
 def falling_stamps(p: Proposal, tables: Tables) -> Iterator[LabelSource]:
     """Yield each place with a date, time or counter for each recording, that is out of order.
 
-    The places are the first words of columns without another use, lines above the header of the
-    first table, and columns of listings of labels. A place counts if its words are dates or times
-    of a known form (`Column.forms`) or numbers of seconds since 1970 (or ms, us, ns), if its name
-    says so (`timestamp`, `created`) and its words have five digits or more, or if it has one word
-    for each recording, and a number in them counts the recordings (`counter_of`). Equal ones are in
+    The places are columns without another use, lines above the header of the first table, and
+    columns of listings of labels. A recording's word is its text in a place; in a column of its
+    table, the cell of the first row. A place counts if its words are dates or times of a known form
+    (`Column.forms`) or numbers of seconds since 1970 (or ms, us, ns), if its name says so
+    (`timestamp`, `created`) and its words have five digits or more, or if it does not change within
+    a recording, and a number in its words counts the recordings (`counter_of`). Equal ones are in
     order, and if several forms fit, one in which they are in order is enough. Times of day without
     a date may begin again. Empty words are left out. `p` is the description so far. Raises
     SettingError for a malformed `windows.trigger`, the condition at which a part begins.

@@ -150,7 +150,11 @@ def read_frame(frame: Any, source: str) -> Table:
     """
     is_plain = frame.index.names == [None] and frame.index.dtype.kind not in "mM"
     frame = frame.reset_index(drop=is_plain)
-    columns = {str(name): frame[name].to_numpy() for name in frame.columns}
+    columns = {}
+    for name, cells in frame.items():
+        if cells.hasnans and not isinstance(cells.dtype, np.dtype):  # it has pandas' NA
+            cells = cells.astype(object).where(cells.notna(), None)
+        columns[str(name)] = cells.to_numpy()
     return Table(source, columns, np.arange(1, len(frame) + 1))
 
 
