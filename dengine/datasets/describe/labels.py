@@ -20,13 +20,13 @@ from ..table import Table
 from .columns import MOST_WORDS, Proposal, Tables, counts_of
 
 GOOD = (
-    *("ok", "pass", "passed", "good", "success", "gut", "true", "i.o.", "i.o", "i_o", "io"),
-    *("accepted", "合格"),
-)
+    "ok", "pass", "passed", "good", "success", "gut", "true", "i.o.", "i.o", "i_o", "io",
+    "accepted", "合格",
+)  # fmt: skip
 BAD = (
-    *("nok", "not ok", "not_ok", "not-ok", "fail", "failed", "bad", "failure", "schlecht", "false"),
-    *("n.i.o.", "n.i.o", "n_i_o", "n-io", "n_io", "nio", "ng", "reject", "rejected", "不合格"),
-)
+    "nok", "not ok", "not_ok", "not-ok", "fail", "failed", "bad", "failure", "schlecht", "false",
+    "n.i.o.", "n.i.o", "n_i_o", "n-io", "n_io", "nio", "ng", "reject", "rejected", "不合格",
+)  # fmt: skip
 UNCHECKED = ("", "-", "--", "pending", "open", "offen", "unchecked", "not checked", "n/a")
 YES = ("1", "true", "yes", "ja")
 NO = ("0", "false", "no", "nein")
