@@ -110,7 +110,7 @@ def tolerance_note(data: Dataset, lower_bound: float) -> str:
     if the share of bad parts in the data set is at most as large: accepting every part would meet
     it. The data set must have a trace.
     """
-    share = 1 - float(data.y.mean())
+    share = 1 - data.y.mean()
     tolerance = 1 - lower_bound
     if share > tolerance:
         return ""

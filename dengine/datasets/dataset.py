@@ -137,7 +137,7 @@ class Dataset:
         """Return a short text: name, number and shape of the traces, good ones, and faults."""
         shape = " x ".join(map(str, self.X.shape[1:]))
         return (
-            f"<Dataset {self.name}: {len(self)} traces, {shape} samples, {int(self.y.sum())} good, "
+            f"<Dataset {self.name}: {len(self)} traces, {shape} samples, {self.y.sum()} good, "
             f"{len(self.faults)} left out>"
         )
 
@@ -181,8 +181,8 @@ class Dataset:
         for name, values in (("cause", self.cause), ("part", self.part), ("label", self.y)):
             if values is not None:
                 frame.insert(0, name, values)
-        frame.attrs[OWN] = {name: getattr(self, name) for name in ABOUT}
-        frame.attrs[OWN] |= {"n_channels": channels, "columns": names}
+        about = {name: getattr(self, name) for name in ABOUT}
+        frame.attrs[OWN] = about | {"n_channels": channels, "columns": names}
         return frame
 
     def select(self, channels: Names) -> "Dataset":

@@ -29,6 +29,7 @@ FOLDER_FILE = "recordings.toml"  # in a folder; beside a single file it is FILE.
 MOST_BYTES = 1_000_000
 ORDERS = {"name", "path", "time"}  # any other `order` is a column
 Words = tuple[str, ...]
+Strings = Sequence[str]
 Stated = Mapping[str, Any]
 Values = dict[str, Any]  # of keys, by name
 
@@ -97,6 +98,9 @@ class RowWords:
         """
         kinds = {word: k for k in ("invalid", "drop", "keep") for word in getattr(self, k)}
         return [kinds.get(word, kinds.get(ANY, "")) for word in words]
+
+
+RowMeanings = Mapping[str, RowWords]  # by column
 
 
 @dataclass(frozen=True, slots=True)
@@ -305,7 +309,7 @@ class Description:
     layout: Literal["files", "long", "wide", "columns", "npz", "mcap"] = "files"
     order: str = "name"
     text: TextForm = TextForm()
-    rows: Mapping[str, RowWords] = field(default_factory=dict)
+    rows: RowMeanings = field(default_factory=dict)
     time: Clock = Clock()
     channels: Mapping[str, Channel] = field(default_factory=dict)
     ignored: Mapping[str, str] = field(default_factory=dict)  # column: unit
@@ -484,7 +488,7 @@ class Description:
 
 
 # The sections, in the order of the file, and what their tables are made of; None: texts.
-SECTIONS: dict[str, Any] = {
+SECTIONS: Values = {
     "text": TextForm,
     "rows": RowWords,
     "time": Clock,
@@ -593,7 +597,7 @@ def _plain(value: Any) -> Any:
     return {k: _plain(v) for k, v in values.items() if v != getattr(default, k)}
 
 
-def flat(prefix: str, value: Mapping[str, Any]) -> Values:
+def flat(prefix: str, value: Stated) -> Values:
     """Return a nested mapping as one dict: `{"a": {"b": 1}}` becomes `{"a.b": 1}`.
 
     An empty mapping within it is left out. If two keys become equal, the later one counts.

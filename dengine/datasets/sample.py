@@ -41,7 +41,7 @@ def write_sample(folder: FilePath, n: int = 200) -> None:
     data = load_dataset("insertion")
     with new_folder(folder) as target:
         for i, row in enumerate(rng.permutation(len(data))[:n], 1):
-            rows = int(rng.integers(960, 1001))
+            rows = rng.integers(960, 1001)
             frame = pd.DataFrame(
                 {
                     "Timestamp": np.arange(rows) / RATE_HZ + (1000.0 + CYCLE_SECONDS * i),

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ..errors import DataError, instead, listed, shortened
 from ..records import Floats, TraceArray
-from .description import TextForm
+from .description import Strings, TextForm
 
 Cells = NDArray[Any]
 LARGEST = 3.4028235e38  # of a sample, which is a float32
@@ -68,10 +68,10 @@ class Table:
     columns: Mapping[str, Cells]
     lines: Sequence[int] | Cells
     units: Mapping[str, str] = field(default_factory=dict)
-    above: Sequence[str] = ()
+    above: Strings = ()
     header: int = 0
     damage: Sequence[UnreadableError] = ()
-    origin: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    origin: Mapping[str, Strings] = field(default_factory=dict)
     path: str = ""
 
     def column(self, name: str) -> Cells:

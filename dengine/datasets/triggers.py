@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import SettingError, shortened
-from ..records import Floats
+from ..records import Floats, TraceArray
 
 MAX_STEP = 1.5  # steps from one sample to the next if none is missing
 
@@ -179,7 +179,7 @@ class StartFinder:
 
 def place(
     times: Sequence[float], values: Floats, start: float, samples: int, step: float
-) -> tuple[NDArray[np.float32], int]:
+) -> tuple[TraceArray, int]:
     """Put samples into a trace, each at the place (index of the trace) nearest to its time.
 
     Parameters

@@ -40,6 +40,7 @@ from functools import partial
 
 from ..errors import counted, expect, percent
 
+Prices = tuple[float, float, float]  # of a check, a bad accepted part, a good rejected part
 OVERDRAFT = 2.0  # false accepts that the priced rule may be behind: the first parts may be unlucky
 BETS = (0.05, 0.1, 0.2, 0.4, 0.7, 0.98)  # never 1: after one bad part its capital would stay 0
 
@@ -292,7 +293,7 @@ class Certificate:
     tolerance: float
     accepted: OutcomeBound
     rejected: OutcomeBound
-    prices: tuple[float, float, float] | None = None
+    prices: Prices | None = None
 
     @property
     def saved(self) -> float | None:
@@ -311,7 +312,7 @@ class Certificate:
         checks, escapes = self._checks_and_escapes(self.prices)
         return checks - escapes
 
-    def _checks_and_escapes(self, prices: tuple[float, float, float]) -> tuple[float, float]:
+    def _checks_and_escapes(self, prices: Prices) -> tuple[float, float]:
         """Return the price of the checks left out, and an upper bound on the cost of bad parts.
 
         Both are about accepted parts and in the unit of `prices`, which are the prices of a check,

@@ -3,6 +3,7 @@ estimator. `ModelPrediction` takes one for its settings (radius, error level, lo
 capacity); on its own it classifies points of any embedding.
 """
 
+from dataclasses import dataclass
 from typing import Any, Self
 
 import numpy as np
@@ -20,6 +21,7 @@ from .rule import DecisionRule
 
 
 # scikit-learn ships no types
+@dataclass(eq=False, repr=False)
 class WilsonRadiusClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
     """Classifier that counts labels within a radius and bounds the success probability.
 
@@ -41,19 +43,11 @@ class WilsonRadiusClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[mi
     kernel it is the Wilson score kernel density classifier of Iversen et al. (2025).
     """
 
-    def __init__(
-        self,
-        radius: float = 0.3,
-        alpha: float = 0.05,
-        lower_bound: float = 0.95,
-        interval: str = "wilson",
-        capacity: int = 10_000,
-    ) -> None:
-        self.radius = radius
-        self.alpha = alpha
-        self.lower_bound = lower_bound
-        self.interval = interval
-        self.capacity = capacity
+    radius: float = 0.3
+    alpha: float = 0.05
+    lower_bound: float = 0.95
+    interval: str = "wilson"
+    capacity: int = 10_000
 
     def fit(self, Z: ArrayLike, y: ArrayLike) -> Self:
         """Make these embeddings the references (labelled points), in place of all earlier ones.
@@ -225,7 +219,7 @@ def classes_of(y: ArrayLike) -> NDArray[Any]:
         of estimators expect.
     """
     check_classification_targets(y)
-    classes = np.unique(np.asarray(y))
+    classes = np.unique(y)
     if len(classes) > 2:
         raise ValueError(
             "Only binary classification is supported. The type of the target is multiclass: "

@@ -88,11 +88,9 @@ class Decider(nn.Module):
         self.mix = MIX
         self.shift = 63 - COIN_BITS
         self.mask = 2**COIN_BITS - 1
-        limit = float("inf") if spec.limit is None else float(spec.limit)
+        limit = float("inf") if spec.limit is None else spec.limit
         self.register_buffer("sensor_limit", torch.tensor(limit, dtype=torch.float64))
-        self.register_buffer(
-            "audit_rate", torch.tensor(float(conditions.audit_rate), dtype=torch.float64)
-        )
+        self.register_buffer("audit_rate", torch.tensor(conditions.audit_rate, dtype=torch.float64))
         self.register_buffer("audit_salt", torch.tensor(audit_salt(conditions.seed)))
 
     def forward(self, x: Tensor, part: int = 0) -> Verdict:

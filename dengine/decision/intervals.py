@@ -25,16 +25,17 @@ from statistics import NormalDist
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ..errors import expect
+from ..records import Floats
 
 SORTING_GUARANTEES = ("pooled", "cost")  # under these the interval around a trace only sorts parts
 SORTING_ERROR_LEVEL = 0.5  # of an interval that only sorts: z = 0.67
 Bounds = tuple[Any, Any]  # two floats for scalar counts, two float64 arrays otherwise
+ScalarBounds = tuple[float, float]
 Interval = Callable[[ArrayLike, ArrayLike, float], Bounds]
-ScalarBound = Callable[[int, int, float], tuple[float, float]]
-FloatArray = NDArray[np.float64]
+ScalarBound = Callable[[int, int, float], ScalarBounds]
 
 
 def interval_error_level(alpha: float, guarantee: str) -> float:
@@ -190,7 +191,7 @@ INTERVALS: dict[str, Interval] = {
 }
 
 
-def wilson_limits(xp: Any, n_success: Any, n_failure: Any, z: float) -> tuple[Any, Any]:
+def wilson_limits(xp: Any, n_success: Any, n_failure: Any, z: float) -> Bounds:
     """Compute Wilson intervals from counts, float64 arrays (`xp` is numpy) or tensors (torch).
 
     Parameters
@@ -214,7 +215,7 @@ def wilson_limits(xp: Any, n_success: Any, n_failure: Any, z: float) -> tuple[An
     return _clip_limits(xp, centre - half_width, centre + half_width, n_success, n_failure)
 
 
-def wald_limits(xp: Any, n_success: Any, n_failure: Any, z: float) -> tuple[Any, Any]:
+def wald_limits(xp: Any, n_success: Any, n_failure: Any, z: float) -> Bounds:
     """Compute Wald intervals from counts, float64 arrays (`xp` is numpy) or tensors (torch).
 
     Parameters
@@ -238,7 +239,7 @@ def wald_limits(xp: Any, n_success: Any, n_failure: Any, z: float) -> tuple[Any,
     return _clip_limits(xp, rate - half_width, rate + half_width, n_success, n_failure)
 
 
-def wilson_bound(n_success: int, n_failure: int, z: float) -> tuple[float, float]:
+def wilson_bound(n_success: int, n_failure: int, z: float) -> ScalarBounds:
     """Compute the Wilson interval of a success probability from two integer counts.
 
     `z` is the normal quantile of the interval (`normal_quantile`). Returns (lower, upper) within
@@ -254,7 +255,7 @@ def wilson_bound(n_success: int, n_failure: int, z: float) -> tuple[float, float
     return max(0.0, min(centre - half_width, rate)), min(1.0, max(centre + half_width, rate))
 
 
-def wald_bound(n_success: int, n_failure: int, z: float) -> tuple[float, float]:
+def wald_bound(n_success: int, n_failure: int, z: float) -> ScalarBounds:
     """Compute the Wald interval of a success probability from two integer counts.
 
     `z` is the normal quantile of the interval (`normal_quantile`). Returns (lower, upper) within
@@ -275,7 +276,7 @@ ARRAY_LIMITS = {"wilson": wilson_limits, "binomial": wald_limits}  # of the same
 
 def scalar_interval(
     interval: str, alpha: float, n_success: int, n_failure: int, z: float
-) -> tuple[float, float]:
+) -> ScalarBounds:
     """Evaluate any interval of `INTERVALS` on two integers; TorchScript cannot compile it.
 
     It has the parameters of a `ScalarBound` behind `interval` and `alpha`; z is not used. Returns
@@ -318,7 +319,7 @@ def _beta_interval(
     return _as_floats(*_clip_limits(np, lower, upper, successes, failures))
 
 
-def _as_counts(n_success: ArrayLike, n_failure: ArrayLike) -> tuple[FloatArray, FloatArray]:
+def _as_counts(n_success: ArrayLike, n_failure: ArrayLike) -> tuple[Floats, Floats]:
     """Return both counts as float64 arrays; ValueError if negative or of different shapes."""
     successes = np.asarray(n_success, dtype=np.float64)
     failures = np.asarray(n_failure, dtype=np.float64)
@@ -332,9 +333,7 @@ def _as_counts(n_success: ArrayLike, n_failure: ArrayLike) -> tuple[FloatArray, 
     return successes, failures
 
 
-def _clip_limits(
-    xp: Any, lower: Any, upper: Any, n_success: Any, n_failure: Any
-) -> tuple[Any, Any]:
+def _clip_limits(xp: Any, lower: Any, upper: Any, n_success: Any, n_failure: Any) -> Bounds:
     """Return interval limits, clipped to [0, 1] and moved to enclose the observed success rate.
 
     The result is (lower, upper), which is (0, 1) if nothing was counted. `lower` and `upper` are
@@ -349,6 +348,6 @@ def _clip_limits(
     return xp.where(total > 0.0, lower, 0.0), xp.where(total > 0.0, upper, 1.0)
 
 
-def _as_floats(lower: FloatArray, upper: FloatArray) -> Bounds:
+def _as_floats(lower: Floats, upper: Floats) -> Bounds:
     """Return arrays as they are, and arrays without a dimension as two floats."""
     return (float(lower), float(upper)) if lower.ndim == 0 else (lower, upper)

@@ -32,8 +32,9 @@ No label is read here, and nothing is clipped.
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
+
+from ..records import Ints, TraceArray
 
 SEGMENTS = 14
 BRIEF = (
@@ -174,9 +175,7 @@ class NoveltyGate(nn.Module):
         return norms
 
 
-def fit_novelty(
-    traces: NDArray[np.float32], margin: float, parts: NDArray[np.int64] | None = None
-) -> NoveltyGate:
+def fit_novelty(traces: TraceArray, margin: float, parts: Ints | None = None) -> NoveltyGate:
     """Fit a novelty gate, the test whether a trace is unlike these (novel), without randomness.
 
     At most 500 (`REFERENCES`) of the traces, evenly spaced in time, become references, to which
@@ -351,7 +350,7 @@ def _standardise(features: Tensor) -> tuple[Tensor, Tensor]:
     return -mean / (deviation + floor), 1.0 / (deviation + floor)
 
 
-def _find_same(traces: NDArray[np.float32], parts: NDArray[np.int64] | None) -> tuple[Tensor, int]:
+def _find_same(traces: TraceArray, parts: Ints | None) -> tuple[Tensor, int]:
     """Return which traces are equal or of one part, and how many are not repeats.
 
     `traces` is (n, C, T), `parts` (n,) holds the hash of the part of each trace. The first result
@@ -389,7 +388,7 @@ def _usual_distance_and_reach(points: Tensor, same: Tensor) -> tuple[float, Tens
     usual = max(1e-3, min(quantile, 6.0 * nine_in_ten))
     reach = torch.full_like(nearest, usual)
     is_outlier = nearest > max(1e-3, min(usual, 3.0 * nine_in_ten))
-    if CLUSTER_SIZE < int(is_outlier.sum()) < len(points):
+    if CLUSTER_SIZE < is_outlier.sum() < len(points):
         rows = squared[is_outlier]
         cluster = rows[:, is_outlier].kthvalue(CLUSTER_SIZE, 1).values
         is_apart = 4.0 * cluster < rows[:, ~is_outlier].amin(1)

@@ -16,7 +16,7 @@ from ..errors import SettingError, expect
 from ..imports import import_class
 from ..limits import ForceLimits
 from ..records import ACTIONS, Action, is_number, is_whole
-from .certificate import Certificate, Outcomes, certify
+from .certificate import Certificate, Outcomes, Prices, certify
 from .intervals import INTERVALS, SORTING_GUARANTEES, Bounds, interval_error_level, normal_quantile
 
 if TYPE_CHECKING:
@@ -104,7 +104,7 @@ class Policy:
     shadow: bool = False
     label_within: int = 1000
     force_limits: tuple[ForceLimits, ...] = ()
-    prices: tuple[float, float, float] = None  # type: ignore[assignment]
+    prices: Prices = None  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
         by_prices = self.prices is not None and self.guarantee is None
@@ -184,7 +184,7 @@ class Policy:
         )
         return limits  # type: ignore[no-any-return]
 
-    def _checked_prices(self) -> tuple[float, float, float]:
+    def _checked_prices(self) -> Prices:
         """Return the prices of a check, a bad accepted part and a good rejected part, as floats.
 
         Raises SettingError if `prices` is no tuple or list of three finite numbers above 0, or if
@@ -383,9 +383,7 @@ class Policy:
         """
         from .rule import action_of
 
-        return ACTIONS[
-            action_of(float(lower), float(upper), self.lower_bound, 1.0 - self.lower_bound)
-        ]
+        return ACTIONS[action_of(lower, upper, self.lower_bound, 1.0 - self.lower_bound)]
 
 
 def check_radius(radius: float) -> None:

@@ -19,13 +19,14 @@ for counts of clusters.
 """
 
 import hashlib
-from collections.abc import Mapping
 from typing import Any, Self
 
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor, nn
+
+from ..records import Arrays, Floats, Ints, State
 
 FEWEST_PARTS = 20  # that came at least twice; fewer say nothing about agreement
 N_NEIGHBOURS = 30  # of other parts, whose labels say what is usual around a point
@@ -37,8 +38,8 @@ CONFIDENCE = 1.645  # standard errors above the estimate: 95 %, one-sided
 def label_agreement(
     points: NDArray[np.float32],
     labels: NDArray[np.int8],
-    spaces: NDArray[np.int64],
-    parts: NDArray[np.int64],
+    spaces: Ints,
+    parts: Ints,
 ) -> float:
     """Bound from above how strongly the labels of one part agree: their intraclass correlation.
 
@@ -85,16 +86,16 @@ def label_agreement(
     )
     products = sums**2 - squares  # of the residuals of different points of one part
     n_pairs = m * (m - 1.0)
-    variance = float((residuals**2).mean())
-    rho = float(products.sum() / (n_pairs.sum() * variance))
+    variance = (residuals**2).mean()
+    rho = products.sum() / (n_pairs.sum() * variance)
     deviations = products / variance - rho * n_pairs
-    error = float(np.sqrt((deviations**2).sum()) / n_pairs.sum())
+    error = np.sqrt((deviations**2).sum()) / n_pairs.sum()
     return float(np.clip(rho + CONFIDENCE * error, 0.0, 1.0))
 
 
 def _success_rate_around(
-    points: NDArray[np.float32], labels: NDArray[np.int8], part: NDArray[np.int64]
-) -> NDArray[np.float64]:
+    points: NDArray[np.float32], labels: NDArray[np.int8], part: Ints
+) -> Floats:
     """Return for each point the success rate among the nearest points of other parts, float64 (n,).
 
     `points` are (n, d), of one embedding space; `labels` (n,) are 1 for success, 0 for failure;
@@ -378,7 +379,9 @@ class RadiusIndex(nn.Module):
         for block, column in zip(blocks, columns, strict=True):
             block[slots] = column[newest].to(block.dtype)
         self.total.add_(len(z))
-        self._count_repeats()
+        all_parts = self.column("parts")
+        known = all_parts[all_parts != 0]
+        self.repeats.fill_(len(known) - len(np.unique(known)))
 
     def relabel(self, number: int, part: int, label: int | None) -> bool:
         """Change the label of the point with a number, or remove the point.
@@ -428,17 +431,9 @@ class RadiusIndex(nn.Module):
         changes if no part has several points in it.
         """
         if int(self.repeats) > 0:
-            self.agreement.fill_(
-                label_agreement(*map(self.column, ("points", "labels", "spaces", "parts")))
-            )
+            self.agreement.fill_(label_agreement(*map(self.column, COLUMNS[:-1])))
 
-    def _count_repeats(self) -> None:
-        """Set `repeats`: the number of points of known parts, less the number of these parts."""
-        parts = self.column("parts")
-        known = parts[parts != 0]
-        self.repeats.fill_(len(known) - len(np.unique(known)))
-
-    def get_state(self) -> dict[str, NDArray[Any]]:
+    def get_state(self) -> State:
         """Return copies of the arrays of the index, by name, from which `from_state` restores it.
 
         `points` is (d, n). `labels` (1 success, 0 failure), `spaces`, `parts` (hashes) and
@@ -450,7 +445,7 @@ class RadiusIndex(nn.Module):
         return state | {name: getattr(self, name).numpy().copy() for name in ("agreement", "total")}
 
     @classmethod
-    def from_state(cls, state: Mapping[str, NDArray[Any]], capacity: int) -> Self:
+    def from_state(cls, state: Arrays, capacity: int) -> Self:
         """Return a new index for `capacity` points with the points of a state.
 
         `state` is what `get_state` returned, and is not changed. With the same capacity each point
@@ -478,6 +473,4 @@ class RadiusIndex(nn.Module):
             self.column("labels").astype(np.float32),
             self.column("spaces"),
         )
-        return hashlib.sha256(
-            b"".join(np.ascontiguousarray(a).tobytes() for a in arrays)
-        ).hexdigest()
+        return hashlib.sha256(b"".join(array.tobytes() for array in arrays)).hexdigest()

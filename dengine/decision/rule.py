@@ -87,9 +87,9 @@ class DecisionRule(nn.Module):
         super().__init__()
         self.alpha = float(alpha)
         self.accept_threshold = float(lower_bound)
-        self.reject_threshold = 1.0 - float(lower_bound)
+        self.reject_threshold = 1.0 - self.accept_threshold
         self.interval = interval
-        error_level = SORTING_ERROR_LEVEL if self.sorts else float(alpha)
+        error_level = SORTING_ERROR_LEVEL if self.sorts else self.alpha
         self.z = normal_quantile(error_level)
         self.scriptable = self.compiles and interval in SCALAR_BOUNDS
         self.bound = SCALAR_BOUNDS.get(interval, partial(scalar_interval, interval, error_level))

@@ -6,7 +6,6 @@ the candidates. `load_dataset` then reads exactly what the description says.
 
 import re
 from collections import Counter
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,7 @@ import numpy as np
 from ...errors import DataError, listed
 from ..checks import check_forms
 from ..dataset import Fault, expect_data
-from ..description import UNKNOWN, Clock, Description, Stated, flat
+from ..description import UNKNOWN, Clock, Description, Stated, Strings, flat
 from ..read.files import as_source, caught, match_files, natural_key, read_file
 from ..read.frames import read_frame
 from ..read.places import without_suffix
@@ -54,7 +53,6 @@ MOST_ROWS = 50_000
 MOST_PIECES = 4  # of a part's curve, in files with numbers behind their names
 FEW = 5  # times as many files of another suffix make a suffix unlikely
 LEAST_PARTS = 10  # that have such pieces
-Names = Sequence[str]
 
 
 def describe(source: Any, stated: Stated | None = None) -> Description:
@@ -128,7 +126,6 @@ def choose_files(p: Proposal, root: Path) -> bool:
     read (`FOREIGN`).
     """
     stated = p.description.files
-    every = names_in(root, ())
     excluded = match_files(root, p.description.exclude)
     names = [name for name in names_in(root, stated) if name not in excluded]
     if not names:
@@ -146,13 +143,13 @@ def choose_files(p: Proposal, root: Path) -> bool:
         return False
     p.base = root if root.is_dir() else root.parent
     p.names = names if stated else [name for name in names if suffix_of(name) == endings[0]]
-    p.others = sorted({*every}.difference(p.names), key=natural_key)
+    p.others = sorted({*names_in(root, ())}.difference(p.names), key=natural_key)
     p.put("files", globs(p.names))
     p.put("format", SUFFIXES.get(suffix_of(p.names[0]), "text"))
     return True
 
 
-def likely_endings(names: Names) -> Names:
+def likely_endings(names: Strings) -> Strings:
     """Return the endings of these file names of which one may tell recordings from other files.
 
     They are the suffixes that more than a fifth as many files have as the most frequent one, and
@@ -192,7 +189,7 @@ def suffix_of(name: str) -> str:
     return Path(name.lower().removesuffix(".gz")).suffix
 
 
-def names_in(root: Path, patterns: Names) -> Names:
+def names_in(root: Path, patterns: Strings) -> Strings:
     """Return the files of a folder that may be recordings: relative paths, run_2 before run_10.
 
     Hidden files, files in hidden folders or outside of the folder (`../x.csv`), `recordings.toml`,
@@ -212,7 +209,7 @@ def names_in(root: Path, patterns: Names) -> Names:
     )
 
 
-def globs(names: Names) -> list[str]:
+def globs(names: Strings) -> list[str]:
     """Return patterns that match the files, one for each suffix; for a single file its path.
 
     They are like `*.csv`, or `**/*.csv` if any file is in a subfolder, and sorted. The suffix has

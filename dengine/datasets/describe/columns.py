@@ -15,7 +15,7 @@ import numpy as np
 
 from ...errors import DataError
 from ...records import Floats
-from ..description import Clock, Description, Stated, TextForm
+from ..description import Clock, Description, Stated, Strings, TextForm
 from ..read.clock import ISO, times_of
 from ..read.split import pattern_of, signals_of, word_columns
 from ..table import Cells, Table
@@ -23,17 +23,17 @@ from ..units import bare, unit_in
 
 DAY = "%Y-%m-%d"
 DAYS = (
-    *("%d.%m.%Y", "%Y/%m/%d", "%m/%d/%Y", "%d/%m/%Y", "%d-%m-%Y", "%m-%d-%Y"),
-    *("%d.%m.%y", "%d-%b-%y", "%d-%b-%Y"),
-)
+    "%d.%m.%Y", "%Y/%m/%d", "%m/%d/%Y", "%d/%m/%Y", "%d-%m-%Y", "%m-%d-%Y",
+    "%d.%m.%y", "%d-%b-%y", "%d-%b-%Y",
+)  # fmt: skip
 TIMES = (
-    *("%H:%M:%S.%f", "%H:%M:%S", "%H:%M:%S:%f", "%H:%M"),
-    *("%I:%M:%S.%f %p", "%I:%M:%S %p", "%I:%M %p"),
-)
+    "%H:%M:%S.%f", "%H:%M:%S", "%H:%M:%S:%f", "%H:%M",
+    "%I:%M:%S.%f %p", "%I:%M:%S %p", "%I:%M %p",
+)  # fmt: skip
 FORMS = (
-    *(DAY, ISO, *DAYS, *TIMES, "%M:%S.%f", "%Y-%m-%d %H:%M:%S.%f UTC", "%Y-%m-%d %H:%M:%S.%f"),
+    DAY, ISO, *DAYS, *TIMES, "%M:%S.%f", "%Y-%m-%d %H:%M:%S.%f UTC", "%Y-%m-%d %H:%M:%S.%f",
     *(f"{day} {time}" for day in DAYS for time in TIMES),
-)
+)  # fmt: skip
 LIKE_A_TIME = re.compile(
     r"\d+[:\-./T](\d+|[A-Za-z]{3})[:\-./T]\d|\d+:\d+\.\d|\d{8}T\d{6}|\d+:\d\d$"
 )
@@ -209,8 +209,8 @@ class Proposal:
     stated: Stated
     description: Description
     base: Path = Path()
-    names: Sequence[str] = ()
-    others: Sequence[str] = ()
+    names: Strings = ()
+    others: Strings = ()
     is_cut: bool = False
     tables: Tables = ()
     columns: Mapping[str, Column] = field(default_factory=dict)
@@ -229,7 +229,7 @@ class Proposal:
             if note:
                 self.notes[key] = note
 
-    def set_aside(self, names: Sequence[str]) -> None:
+    def set_aside(self, names: Strings) -> None:
         """Move these files from `names`, which hold recordings, to `others`."""
         self.others = [*self.others, *names]
         self.names = [name for name in self.names if name not in names]

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ...errors import DataError, listed
-from ..description import UNKNOWN, Clock, LabelSource, TextForm
+from ..description import UNKNOWN, Clock, LabelSource, Strings, TextForm
 from ..read.clock import has_day, times_of
 from ..read.files import DATE, HALF_DAY, UNSORTED, natural_key, sort_key
 from ..read.places import listing_table, stem_of
@@ -53,10 +53,12 @@ def propose_order(p: Proposal) -> None:
     about = p.description
     tables = tables_of(p)
     stems = {table.path: stem_of(about, table.path) for table in tables}
-    names = {path: f"{_last(stem)} {stem}" for path, stem in stems.items()}  # then the folders
+    names = {
+        path: f"{stem.rpartition('/')[2]} {stem}" for path, stem in stems.items()
+    }  # then the folders
     by_name = [*stems]
     if about.layout != "columns":
-        by_name.sort(key=lambda path: natural_key(_last(path)))
+        by_name.sort(key=lambda path: natural_key(path.rpartition("/")[2]))
     by_path = sorted(stems, key=lambda path: natural_key(stems[path]))
     proved = {
         order: files
@@ -85,12 +87,7 @@ def propose_order(p: Proposal) -> None:
         p.put("order", UNKNOWN, f"name, or {other}: {place} has another order")
 
 
-def _last(path: str) -> str:
-    """Return the last name in a path."""
-    return path.rpartition("/")[2]
-
-
-def counts_parts(names: Sequence[str]) -> bool:
+def counts_parts(names: Strings) -> bool:
     """Return whether names in their order prove that the parts were made in this order.
 
     What they differ in first must belong to a date that begins with the year, or be a number,
@@ -125,7 +122,7 @@ def fits_all(pattern: re.Pattern[str], pieces: Sequence[Any]) -> bool:
     return all(map(pattern.fullmatch, map(str, pieces)))
 
 
-def counter_of(words: Sequence[str]) -> list[int]:
+def counter_of(words: Strings) -> list[int]:
     """Return the first number in each word that counts them; empty if none does.
 
     Each word must have it, another one in each, and they must be close: the largest is less than
@@ -169,7 +166,7 @@ def falling_stamps(p: Proposal, tables: Tables) -> Iterator[LabelSource]:
             yield source
 
 
-def stamps_of(words: Sequence[str], is_named: bool) -> Iterator[list[Any]]:
+def stamps_of(words: Strings, is_named: bool) -> Iterator[list[Any]]:
     """Yield what words are sorted by if they are dates or times, for each form that fits.
 
     Nothing is yielded for other words. Times of day of which few are smaller than the one before

@@ -10,7 +10,15 @@ from dataclasses import replace
 import numpy as np
 
 from ...errors import DataError, listed
-from ..description import ANY, UNKNOWN, LabelSource, PartSource, RowWords, expect_one_of
+from ..description import (
+    ANY,
+    UNKNOWN,
+    LabelSource,
+    PartSource,
+    RowMeanings,
+    RowWords,
+    expect_one_of,
+)
 from ..read.files import natural_key
 from ..read.recordings import is_dropped, kept_rows
 from ..read.split import match_numbered
@@ -90,7 +98,7 @@ def propose_roles(p: Proposal) -> None:
     p.put("ignored", {column.name: column.unit for column in p.unused})
 
 
-def set_rows(p: Proposal, rows: Mapping[str, RowWords]) -> None:
+def set_rows(p: Proposal, rows: RowMeanings) -> None:
     """Set `[rows]` in `p`, and leave the rows that are no samples out of its tables and columns.
 
     A recording keeps all rows if it lacks a column of `rows`, or has a word without a meaning

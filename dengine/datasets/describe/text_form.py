@@ -18,7 +18,7 @@ import numpy as np
 
 from ...errors import DataError, listed
 from ..dataset import Fault
-from ..description import UNKNOWN, Stated, TextForm
+from ..description import UNKNOWN, Stated, Strings, TextForm
 from ..read.files import caught, natural_key
 from ..read.text import BLANK, COMMENT, LATIN, header_names, split_line, to_utf8, to_utf8_or_latin
 from ..table import pattern_of
@@ -43,7 +43,7 @@ WHOLE = re.compile(r"-?\d+(\.0*)?(e\+00)?")
 UNIT_WORDS = re.compile(
     r"(?i)[\[(]?(hh:mm(:ss)?|dd\.mm\.yyyy|[\d.]+ ?[mu]?s|[mun]?s(ecs?)?|min|h)[\])]?"
 )
-Rows = Sequence[Sequence[str]]
+Rows = Sequence[Strings]
 
 
 class Look(NamedTuple):
@@ -114,7 +114,7 @@ def decode(content: bytes, stated: str) -> tuple[str, str]:
     return encoding, text.decode()[:MOST_BYTES]
 
 
-def _share_of_numbers(lines: Sequence[str], delimiter: str) -> tuple[float, int, str]:
+def _share_of_numbers(lines: Strings, delimiter: str) -> tuple[float, int, str]:
     """Return the score of a delimiter, the most frequent number of cells, and the delimiter.
 
     The score says how well the delimiter splits the lines into numbers. It is the share of lines
@@ -161,7 +161,7 @@ def _first_row(rows: Rows, width: int) -> int:
     return first + is_header
 
 
-def is_numbering(cells: Sequence[str]) -> bool:
+def is_numbering(cells: Strings) -> bool:
     """Return whether at least 20 cells are numbers that strictly increase; others are ignored.
 
     They increase in equal steps (within 1 %), or in the order of `natural_key`, which reads 0.25 as
@@ -218,13 +218,13 @@ def _head_lines(rows: Rows, width: int, stated: Stated) -> tuple[int, int]:
     return max(heads, default=0), units
 
 
-def _share_of_units(row: Sequence[str]) -> float:
+def _share_of_units(row: Strings) -> float:
     """Return the share of units among the cells that are not empty, of which one is needed."""
     words = [*filter(None, row)]
     return sum(is_unit(word) or bool(UNIT_WORDS.fullmatch(word)) for word in words) / len(words)
 
 
-def propose_form(p: Proposal, contents: Mapping[str, bytes], faults: list[Fault]) -> Sequence[str]:
+def propose_form(p: Proposal, contents: Mapping[str, bytes], faults: list[Fault]) -> Strings:
     """Set `[text]` in `p` to the text form of most files; return the names of these files.
 
     `p` is the description so far, and `[text]` its section on how text files are written. Files
@@ -288,7 +288,7 @@ def _propose_keys(p: Proposal, looks: Sequence[Look]) -> None:
     propose_marks(p, [*filter(NUMBER.fullmatch, cells)])
 
 
-def _column_names(usual: Look) -> Sequence[str]:
+def _column_names(usual: Look) -> Strings:
     """Return the names of columns for `text.names`; empty if the header names each column.
 
     `#` or `%` at the beginning of the header is skipped. If the header has more cells than there

@@ -6,7 +6,7 @@ another topic has in each row the newest `data` of that topic.
 """
 
 import struct
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator
 from dataclasses import replace
 from operator import attrgetter
 from pathlib import Path
@@ -15,7 +15,7 @@ from typing import Any
 from ...errors import DataError, instead, listed
 from ...files import UNREADABLE, read_errors
 from ..dataset import Fault
-from ..description import Description
+from ..description import Description, Strings
 from ..table import Table, UnreadableError
 from .files import caught
 from .frames import read_frame
@@ -60,7 +60,7 @@ def read_messages(path: Path, topics: Collection[str] | None) -> Iterator[tuple[
 
 
 def read_bag(
-    base: Path, names: Sequence[str], title: str, description: Description, faults: list[Fault]
+    base: Path, names: Strings, title: str, description: Description, faults: list[Fault]
 ) -> Table:
     """Return a table with a row for each message that has the channels, in the order of `log_time`.
 

@@ -121,7 +121,7 @@ def _dates(table: Table, name: str, unit: str, clock: Clock) -> Floats:
     """
     import pandas as pd
 
-    texts = pd.Series(table.column(name)).astype(str).str.strip().str.replace(",", ".", regex=False)
+    texts = pd.Series(table.column(name)).astype(str).str.strip().str.replace(",", ".")
     form = "ISO8601" if unit == ISO else unit.replace(",", ".")
     with instead(
         UnreadableError, f"Expected times of the form {unit}", ValueError, AttributeError, re.error

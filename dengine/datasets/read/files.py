@@ -3,7 +3,7 @@
 import gzip
 import re
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from itertools import chain
 from pathlib import Path
@@ -11,7 +11,7 @@ from typing import Any
 
 from ...errors import DataError, instead, shortened
 from ..dataset import Fault
-from ..description import FOLDER_FILE, Description
+from ..description import FOLDER_FILE, Description, Strings
 from ..table import UnreadableError
 
 GZIP = ".gz"
@@ -60,7 +60,7 @@ def as_source(source: Any) -> Any:
         return Path(source)
 
 
-def match_files(root: Path, patterns: Sequence[str]) -> set[str]:
+def match_files(root: Path, patterns: Strings) -> set[str]:
     """Return the files below a folder that any pattern matches, as paths relative to the folder.
 
     The paths have `/` between folders. Folders that match are left out; `**` at the end stands for

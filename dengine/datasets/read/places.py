@@ -4,14 +4,14 @@ header, or in a listing, which is a file with a row for each recording or part.
 
 import re
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from ...errors import DataError, instead, listed, shortened
 from ..dataset import Fault
-from ..description import Description, LabelSource, PartSource, TextForm
+from ..description import Description, LabelSource, PartSource, Strings, TextForm
 from ..table import Table, UnreadableError
 from .files import natural_key, read_file
 from .frames import read_parquet
@@ -22,25 +22,17 @@ SUFFIX = re.compile(r"\.[A-Za-z]\w{0,7}(\.gz)?$")  # of a file
 MARKS = " \t;,:：=\"'"  # around the words of a line
 
 
-def without_label(source: LabelSource, path: str) -> str:
-    """Return a path without the text of the group of `source.path`, removed in each match.
-
-    Without a match, or if `source.path` is "", it is the whole path. Raises re.error if that is no
-    regular expression, and IndexError if it matches but has no group.
-    """
-    return re.sub(
-        source.path or "(?!)", lambda match: match[0].replace(match[1] or "", "", 1), path
-    )
-
-
 def stem_of(description: Description, path: str) -> str:
     """Return a path without its suffix, and without the words in it that are labels or checks.
 
-    Raises re.error and IndexError as `without_label` does.
+    Of each match of a regular expression for labels, `source.path`, the text of its group is
+    removed. Raises re.error if that is no regular expression, and IndexError if it matches but has
+    no group.
     """
     path = without_suffix(path)
     for source in description.labels:
-        path = without_label(source, path)
+        if source.path:
+            path = re.sub(source.path, lambda match: match[0].replace(match[1] or "", "", 1), path)
     return path
 
 
@@ -70,7 +62,7 @@ def path_word(path: str, pattern: str) -> str:
     return match[1]
 
 
-def line_word(lines: Sequence[str], beginning: str) -> str:
+def line_word(lines: Strings, beginning: str) -> str:
     """Return the word behind `beginning` in a line that begins with it, "" if nothing is there.
 
     If several lines begin with it, those are used in which it fills the whole first cell; if there
@@ -95,7 +87,7 @@ def line_word(lines: Sequence[str], beginning: str) -> str:
 
 
 def words_of(
-    source: PartSource | LabelSource, table: Table, columns: Sequence[str], at: str = "same"
+    source: PartSource | LabelSource, table: Table, columns: Strings, at: str = "same"
 ) -> list[str]:
     """Return the words that a source of labels or of part numbers has for a recording.
 

@@ -4,7 +4,7 @@ Files are split into one table for each part, each table becomes a `Recording`, 
 a `Dataset`. What does not follow the description becomes a `Fault`.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ from ...records import FITS, Floats, TraceArray
 from ...traces import can_fit_length, fit_length
 from ..checks import check_description, without_repeats
 from ..dataset import Dataset, Fault, Progress, make_dataset, unit_text
-from ..description import ANY, ORDERS, Channel, Description, RowWords, TextForm
+from ..description import ANY, ORDERS, Channel, Description, RowMeanings, TextForm
 from ..table import Recording, Table, UnreadableError, as_word
 from ..units import bare, conversion, unit_in
 from .bags import read_bag
@@ -109,7 +109,7 @@ def recording_of(
 
 
 @instead(UnreadableError, "Expected columns of one length", IndexError, ValueError)
-def kept_rows(table: Table, rows: Mapping[str, RowWords]) -> Table:
+def kept_rows(table: Table, rows: RowMeanings) -> Table:
     """Return a table of the rows that are samples; rows of lost samples stay, unchanged.
 
     A word is the text of a cell, and lost samples are read as NaN later. A column takes its words
@@ -299,7 +299,7 @@ def parts_of(file: str | Table, description: Description, base: Path) -> Iterato
             yield from cut(part, description, base) if description.is_cut else [part]
 
 
-def is_dropped(part: Table, rows: Mapping[str, RowWords]) -> bool:
+def is_dropped(part: Table, rows: RowMeanings) -> bool:
     """Return whether a column in `rows` has a single cell for a part, with a word to drop.
 
     `part` has the samples of one workpiece, or a long recording of several. `rows` says by column

@@ -1,14 +1,14 @@
 """Split what a file holds into one table for each part, by its layout."""
 
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from itertools import chain
 
 import numpy as np
 
 from ...errors import DataError, instead
-from ..description import ANY, ORDERS, Description
+from ..description import ANY, ORDERS, Description, Strings
 from ..table import Cells, Table, UnreadableError, as_word
 from ..triggers import as_trigger
 from . import frames
@@ -56,7 +56,7 @@ def word_columns(description: Description) -> set[str]:
     return words.union(source.column for source in description.labels)
 
 
-def signals_of(description: Description) -> Sequence[str]:
+def signals_of(description: Description) -> Strings:
     """Return the columns that the trigger reads, which cuts a long recording; none without one.
 
     Raises SettingError for a malformed trigger.

@@ -7,13 +7,13 @@ file again, and names the cell that does not fit.
 import csv
 import io
 import re
-from collections.abc import Container, Sequence
+from collections.abc import Container
 from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
 
-from ..description import TextForm
+from ..description import Strings, TextForm
 from ..table import Table, UnreadableError
 
 COMMENT = re.compile(r"^[#%]+\s*")
@@ -123,7 +123,7 @@ def split_line(line: str, delimiter: str) -> list[str]:
     return line.split(delimiter)
 
 
-def header_names(cells: Sequence[str]) -> list[str]:
+def header_names(cells: Strings) -> list[str]:
     """Return the names of columns in a header; empty cells become `column1`, `column2`, ...
 
     Blanks around a name are left out. A name that repeats gets a number, like `X.2`.
@@ -144,7 +144,7 @@ def _header_line(content: bytes, header: str) -> int:
     raise UnreadableError(f"Expected a header that begins with {header!r}, got none")
 
 
-def _names(top: Sequence[str], header: int, form: TextForm) -> list[str]:
+def _names(top: Strings, header: int, form: TextForm) -> list[str]:
     """Return the names of the columns: those of `form.names`, otherwise the cells of the header.
 
     A last name `x*` of `form.names` becomes `x0`, `x1`, ..., as many as the first line of samples
