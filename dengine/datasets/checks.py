@@ -12,7 +12,7 @@ import numpy as np
 
 from ..errors import DataError, instead, listed, percent
 from ..folds import content_hash
-from .dataset import LEAST_RATE_HZ, MOST_RATE_HZ, Dataset, Fault, expect_all
+from .dataset import LEAST_RATE_HZ, MOST_RATE_HZ, Dataset, Fault, Faults, expect_all
 from .description import Clock, Description, TextForm
 from .table import Recording
 
@@ -77,7 +77,7 @@ def check_forms(clock: Clock, text: TextForm) -> None:
     )
 
 
-def without_repeats(recordings: Sequence[Recording]) -> tuple[list[Recording], list[Fault]]:
+def without_repeats(recordings: Sequence[Recording]) -> tuple[list[Recording], Faults]:
     """Return the recordings without repeated traces, and a fault for each recording left out.
 
     The recordings kept stay in their order. All traces must have the same shape (C, T). Two traces
@@ -92,7 +92,7 @@ def without_repeats(recordings: Sequence[Recording]) -> tuple[list[Recording], l
     for hash_, recording in zip(hashes, recordings, strict=True):
         groups[hash_].append(recording)
     kept: list[Recording] = []
-    faults: list[Fault] = []
+    faults: Faults = []
     for group in groups.values():
         source = group[0].source
         message = f"Expected one label for the samples of {source}, got two"

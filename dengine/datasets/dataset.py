@@ -72,6 +72,9 @@ class Fault:
         return f"{self.source}{line}{column}: {self.message}"
 
 
+Faults = list[Fault]
+
+
 @dataclass(frozen=True, slots=True, repr=False)
 class Dataset:
     """Labelled traces, in the order of their recording.

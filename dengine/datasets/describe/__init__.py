@@ -14,7 +14,7 @@ import numpy as np
 
 from ...errors import DataError, listed
 from ..checks import check_forms
-from ..dataset import Fault, expect_data
+from ..dataset import Faults, expect_data
 from ..description import UNKNOWN, Clock, Description, Stated, Strings, flat
 from ..read.files import as_source, caught, match_files, natural_key, read_file
 from ..read.frames import read_frame
@@ -235,7 +235,7 @@ def read_tables(p: Proposal) -> list[Table]:
     is missing.
     """
     contents = dict[str, bytes]()
-    faults = list[Fault]()
+    faults: Faults = []
     for i in sorted({*np.linspace(0, len(p.names) - 1, MOST_FILES).astype(int)}):
         name = p.names[i]
         if sum(map(len, contents.values())) < MOST_BYTES:

@@ -10,7 +10,7 @@ import numpy as np
 from ...errors import listed
 from ...records import Floats
 from ..checks import check_forms
-from ..dataset import LEAST_RATE_HZ, MOST_RATE_HZ, Fault
+from ..dataset import LEAST_RATE_HZ, MOST_RATE_HZ, Faults
 from ..description import ANY, UNKNOWN, TextForm
 from ..read.clock import UNITS, check_steps, has_day, scale_of, times_of
 from ..read.files import caught
@@ -263,7 +263,7 @@ def propose_rate(p: Proposal, tables: Tables) -> None:
         spans = [seconds[-1] - seconds[0] for _, seconds in clocks]
         n_steps = math.ceil(np.quantile(spans, SHORT) * p.description.time.rate_hz - EVEN)
         p.put("traces.samples", n_steps + 1)
-    faults = list[Fault]()
+    faults: Faults = []
     for table, seconds in clocks:
         with caught(faults, table.source):
             check_steps(seconds, p.description.time, table)  # with the rate

@@ -12,7 +12,7 @@ from dataclasses import replace
 from itertools import permutations
 
 from ...errors import DataError
-from ..dataset import Fault
+from ..dataset import Faults
 from ..description import SOURCES, UNKNOWN, Description, LabelSource, PartSource
 from ..read.files import caught
 from ..read.places import listing_table, part_of, read_labels, without_suffix
@@ -231,7 +231,7 @@ def words_of(p: Proposal, source: LabelSource, tables: Tables, parts: Words) -> 
     DataError if the source's listing cannot be read or lacks a column.
     """
     words = dict[str, str]()
-    faults = list[Fault]()
+    faults: Faults = []
     reader = read_labels(p.base, source, p.description.text)
     for table in tables:
         with caught(faults, table.source):

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ...errors import DataError, listed
-from ..dataset import Fault
+from ..dataset import Faults
 from ..description import UNKNOWN, Stated, Strings, TextForm
 from ..read.files import caught, natural_key
 from ..read.text import BLANK, COMMENT, LATIN, header_names, split_line, to_utf8, to_utf8_or_latin
@@ -224,7 +224,7 @@ def _share_of_units(row: Strings) -> float:
     return sum(is_unit(word) or bool(UNIT_WORDS.fullmatch(word)) for word in words) / len(words)
 
 
-def propose_form(p: Proposal, contents: Mapping[str, bytes], faults: list[Fault]) -> Strings:
+def propose_form(p: Proposal, contents: Mapping[str, bytes], faults: Faults) -> Strings:
     """Set `[text]` in `p` to the text form of most files; return the names of these files.
 
     `p` is the description so far, and `[text]` its section on how text files are written. Files

@@ -14,7 +14,7 @@ from typing import Any
 
 from ...errors import DataError, instead, listed
 from ...files import UNREADABLE, read_errors
-from ..dataset import Fault
+from ..dataset import Faults
 from ..description import Description, Strings
 from ..table import Table, UnreadableError
 from .files import caught
@@ -60,7 +60,7 @@ def read_messages(path: Path, topics: Collection[str] | None) -> Iterator[tuple[
 
 
 def read_bag(
-    base: Path, names: Strings, title: str, description: Description, faults: list[Fault]
+    base: Path, names: Strings, title: str, description: Description, faults: Faults
 ) -> Table:
     """Return a table with a row for each message that has the channels, in the order of `log_time`.
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from ...errors import DataError, instead, shortened
-from ..dataset import Fault
+from ..dataset import Fault, Faults
 from ..description import FOLDER_FILE, Description, Strings
 from ..table import UnreadableError
 
@@ -113,7 +113,7 @@ def read_file(path: Path) -> bytes:
 
 
 @contextmanager
-def caught(faults: list[Fault], source: str) -> Iterator[None]:
+def caught(faults: Faults, source: str) -> Iterator[None]:
     """Context manager that turns a DataError in its block into a fault, and suppresses it.
 
     The fault, which says why a file or recording is left out, is appended to `faults`. It has

@@ -16,7 +16,7 @@ from ...errors import DataError, instead, listed
 from ...records import FITS, Floats, TraceArray
 from ...traces import can_fit_length, fit_length
 from ..checks import check_description, without_repeats
-from ..dataset import Dataset, Fault, Progress, make_dataset, unit_text
+from ..dataset import Dataset, Faults, Progress, make_dataset, unit_text
 from ..description import ANY, ORDERS, Channel, Description, RowMeanings, TextForm
 from ..table import Recording, Table, UnreadableError, as_word
 from ..units import bare, conversion, unit_in
@@ -216,7 +216,7 @@ def read_recordings(
         If the index of the DataFrame is named like one of its columns.
     """
     check_description(description)
-    faults: list[Fault] = []
+    faults: Faults = []
     name, base, files = files_of(source, description, faults)
     labels = [read_labels(base, label, description.text) for label in description.labels]
     recordings: list[Recording] = []
@@ -256,7 +256,7 @@ def read_recordings(
 
 
 def files_of(
-    source: Any, description: Description, faults: list[Fault]
+    source: Any, description: Description, faults: Faults
 ) -> tuple[str, Path, Sequence[str | Table]]:
     """Return the name of a data set, its folder, and what to read: files in it, or a table.
 

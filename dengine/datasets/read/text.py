@@ -13,13 +13,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..description import Strings, TextForm
+from ..description import ANY, Strings, TextForm
 from ..table import Table, UnreadableError
 
 COMMENT = re.compile(r"^[#%]+\s*")
 LATIN = "cp1252"  # reads nearly any text
 BLANK = " "
-REST = "*"  # at the end of the last name: it stands for all columns that remain
 
 
 def read_text(
@@ -157,8 +156,8 @@ def _names(top: Strings, header: int, form: TextForm) -> list[str]:
     line, 0 for none. form : how the file is written, the section `[text]` of a description.
     """
     names = [*form.names]
-    if names and names[-1].endswith(REST):
-        rest = names.pop().removesuffix(REST)
+    if names and names[-1].endswith(ANY):
+        rest = names.pop().removesuffix(ANY)
         n = len(split_line(top[-1], form.delimiter)) - len(names)
         names += [f"{rest}{i}" for i in range(n)]
     elif not names:
@@ -207,7 +206,7 @@ def _read_plain(
     is_whole = len(frame) == len(table.lines) and isinstance(frame.index, pd.RangeIndex)
     if not is_whole or frame.iloc[:, -1].isin(["", np.nan]).any():  # the end of a cut row
         return None
-    columns = {**table.columns}
+    columns = {}
     for name, cells in frame.items():
         if name in texts:  # equal words are one object
             columns[name] = np.array(cells.array.categories, dtype=object)[cells.array.codes]
