@@ -33,7 +33,7 @@ from ..records import Floats
 SORTING_GUARANTEES = ("pooled", "cost")  # under these the interval around a trace only sorts parts
 SORTING_ERROR_LEVEL = 0.5  # of an interval that only sorts: z = 0.67
 Bounds = tuple[Any, Any]  # two floats for scalar counts, two float64 arrays otherwise
-ScalarBounds = tuple[float, float]
+ScalarBounds = tuple[float, float]  # lower, upper
 Interval = Callable[[ArrayLike, ArrayLike, float], Bounds]
 ScalarBound = Callable[[int, int, float], ScalarBounds]
 

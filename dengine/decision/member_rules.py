@@ -3,7 +3,7 @@ derive from `MemberRule` and decide by `members.MemberEvidence`, which opens and
 the score. `policy.RULES` says which one belongs to which guarantee.
 """
 
-import torch
+from torch import jit
 
 from .members import MemberEvidence
 from .rule import DecisionRule
@@ -37,7 +37,7 @@ class MemberRule(DecisionRule):
         """
         return self.evidence.action(lower, upper)
 
-    @torch.jit.export
+    @jit.export
     def update(
         self,
         lower: float,
@@ -52,7 +52,7 @@ class MemberRule(DecisionRule):
         """
         self.evidence.update(lower, upper, success, predicted, inclusion_probability)
 
-    @torch.jit.export
+    @jit.export
     def observe(self, n_unreported: int, novel: bool) -> None:
         """Update the drift detectors, which may start the safe mode.
 
@@ -60,12 +60,12 @@ class MemberRule(DecisionRule):
         """
         self.evidence.observe(n_unreported, novel)
 
-    @torch.jit.export
+    @jit.export
     def safe_mode(self) -> int:
         """Return why the safe mode began: a position in `SAFE_MODES`, 0 outside of one."""
         return int(self.evidence.safe_mode.item())
 
-    @torch.jit.unused
+    @jit.unused
     def start_in_safe_mode(self, safe_mode: int) -> None:
         """Accept and reject nothing from the start, like after an alarm, until outcomes allow it.
 

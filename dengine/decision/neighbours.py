@@ -12,7 +12,6 @@ from .rule import DecisionRule
 
 CERTAIN = REASONS.index(Reason.CERTAIN)
 UNCERTAIN = REASONS.index(Reason.UNCERTAIN)
-SAFE_MODE = REASONS.index(Reason.SAFE_MODE)
 
 
 def fade(probability: float, n_labels: int, prior_labels: float) -> float:
@@ -55,12 +54,12 @@ class RadiusNeighbours(nn.Module):
         super().__init__()
         self.scored = scored
         self.prior_labels = float(rule.prior_labels)
-        self.references: RadiusIndex = references
-        self.rule: DecisionRule = rule
+        self.references = references
+        self.rule = rule
         self.radius = float(radius)
         self.certain = CERTAIN
         self.uncertain = UNCERTAIN
-        self.safe_mode = SAFE_MODE
+        self.safe_mode = REASONS.index(Reason.SAFE_MODE)
 
     @torch.jit.export
     def reason(self, action: int) -> int:

@@ -13,8 +13,7 @@ and the exported file run the same lines.
 from functools import partial
 from typing import Any, Self
 
-import torch
-from torch import nn
+from torch import jit, nn
 
 from ..records import ActionCode
 from .intervals import SCALAR_BOUNDS, SORTING_ERROR_LEVEL, normal_quantile, scalar_interval
@@ -112,7 +111,7 @@ class DecisionRule(nn.Module):
         """
         return action_of(lower, upper, self.accept_threshold, self.reject_threshold)
 
-    @torch.jit.export
+    @jit.export
     def update(
         self,
         lower: float,
@@ -136,7 +135,7 @@ class DecisionRule(nn.Module):
             check, the audit rate for an audit, 0 for a line stop or a confirmation.
         """
 
-    @torch.jit.export
+    @jit.export
     def observe(self, n_unreported: int, novel: bool) -> None:
         """Take note of what is known without a label; called before each `update`.
 
@@ -150,7 +149,7 @@ class DecisionRule(nn.Module):
             Whether the trace of the part at hand was novel.
         """
 
-    @torch.jit.export
+    @jit.export
     def safe_mode(self) -> int:
         """Return why the safe mode began: a position in `SAFE_MODES`, 0 outside of one.
 
@@ -158,19 +157,19 @@ class DecisionRule(nn.Module):
         """
         return 0
 
-    @torch.jit.unused
+    @jit.unused
     def start_in_safe_mode(self, safe_mode: int) -> None:
         """Start in a safe mode, like after an alarm; here it does nothing.
 
         `safe_mode` is a `SafeMode`. A rule without a safe mode, like the paper's, ignores it.
         """
 
-    @torch.jit.unused
+    @jit.unused
     def clone(self) -> Self:
         """Return a rule with the same settings that has learned nothing."""
         return type(self)(self.alpha, self.accept_threshold, self.interval, *self.extra_arguments)
 
-    @torch.jit.unused
+    @jit.unused
     def learns(self) -> bool:
         """Return whether the rule can learn: it has buffers, or its own `update` or `observe`."""
         methods = (type(self).update, type(self).observe)
