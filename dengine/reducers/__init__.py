@@ -28,16 +28,17 @@ if TYPE_CHECKING:
     from .umap import UmapReducer as UmapReducer
     from .umap_learn import UmapLearnReducer as UmapLearnReducer
 
-# Module and class of each reducer by its name; the module is imported when the class is needed.
+# Class of each reducer by its name, which is also that of its module, with `_` in place of `-`. The
+# module is imported when the class is needed.
 _NAMED = {
-    "conv": ("conv", "ConvReducer"),
-    "umap": ("umap", "UmapReducer"),
-    "umap-learn": ("umap_learn", "UmapLearnReducer"),
-    "pca": ("pca", "PcaReducer"),
-    "rocket": ("rocket", "RocketReducer"),
+    "conv": "ConvReducer",
+    "umap": "UmapReducer",
+    "umap-learn": "UmapLearnReducer",
+    "pca": "PcaReducer",
+    "rocket": "RocketReducer",
 }
 _LAZY = {"base": ["Reducer", "CrossFitted"], "torch_reducer": ["TorchReducer"]}
-_LAZY |= {module: [class_name] for module, class_name in _NAMED.values()}
+_LAZY |= {name.replace("-", "_"): [class_name] for name, class_name in _NAMED.items()}
 
 MAX_INTEGER = 2**31 - 1  # of a parameter
 TRANSFORMER_METHODS = ("fit", "transform", "get_params")
@@ -68,7 +69,7 @@ def reducer_class(name: str) -> type:
         f"a reducer among {', '.join(_NAMED)}, or module:Class of your own",
         name,
     )
-    cls: type = __getattr__(_NAMED[name][1]) if name in _NAMED else import_class(name)
+    cls: type = __getattr__(_NAMED[name]) if name in _NAMED else import_class(name)
     missing = [method for method in TRANSFORMER_METHODS if not callable(getattr(cls, method, None))]
     if missing:
         raise SettingError(

@@ -39,9 +39,9 @@ from ..decision.classifier import classes_of
 from ..errors import SettingError, TraceError, expect, instead
 from ..folds import content_fold
 from ..records import Arrays, State, is_whole
+from ..records import Ints as Ints
 
 Floats = NDArray[np.float32]
-Ints = NDArray[np.int64]
 OUTLIER_DISTANCE = 50.0  # times the median distance from the median point
 OUTLIER_SHARE = 0.05  # more points than this share are not outliers
 NO_ROWS: Floats = np.zeros((0, 0), np.float32)

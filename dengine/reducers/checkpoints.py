@@ -49,7 +49,7 @@ def load_checkpoint(members: Members, path: str | Path) -> None:
         names[name]: shape_of_member(name, value, members.count) for name, value in state.items()
     }
     fits = {name: value.shape for name, value in weights.items()} == shapes
-    is_finite = all(bool(value.isfinite().all()) for value in weights.values())
+    is_finite = all(value.isfinite().all() for value in weights.values())
     expect(
         fits and is_finite,
         "finite weights of this network, for traces of this many channels",

@@ -159,14 +159,13 @@ class Encoder(nn.Module):
         super().__init__()
         self.preprocessor = preprocessor
         self.members = members
-        self.count = members.count
         self.dim = dim
         self.difference_range = DIFFERENCE_RANGE
 
     def forward(self, x: Tensor) -> Tensor:
         """Raw traces (B, C, T) -> (B, K, dim)."""
         x = self.preprocessor(x)
-        return self.embed(x.unsqueeze(1).expand(-1, self.count, -1, -1))
+        return self.embed(x.unsqueeze(1).expand(-1, self.members.count, -1, -1))
 
     @torch.jit.export
     def embed(self, x: Tensor) -> Tensor:

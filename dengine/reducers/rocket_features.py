@@ -31,11 +31,11 @@ from itertools import combinations, pairwise
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
+from numpy.random import Generator
 from torch import Tensor, nn
 
 from ..errors import SettingError
-from .base import Floats
+from .base import Floats, Ints
 
 TAPS = 9  # of a kernel; MiniRocket has 84 = 9 choose 3 ways to place three 2s among -1s
 GROUP_SIZE = 8  # kernels that compete with each other
@@ -148,10 +148,8 @@ class RocketEncoder(nn.Module):
             "place_mean": torch.full((sparse_places,), 1.0 / sparse_places),
             "zero": torch.zeros(1, channels, 1),
         }
-        for name, value in learned.items():
-            self.register_buffer(name, value)
-        for name, value in constants.items():
-            self.register_buffer(name, value, persistent=False)
+        for name, value in (learned | constants).items():
+            self.register_buffer(name, value, persistent=name in learned)
 
     def forward(self, x: Tensor) -> Tensor:
         """Raw traces (B, C, T) -> standardised, clipped features (B, P)."""
@@ -277,7 +275,7 @@ class RocketEncoder(nn.Module):
         sums = wins.view(2 * n_groups * size, self.n_sparse_places, batch).sum(1)
         return sums.mul_(1.0 / self.n_sparse_places).sqrt_().t()
 
-    def learn(self, X: Tensor, rng: np.random.Generator) -> None:
+    def learn(self, X: Tensor, rng: Generator) -> None:
         """Set channel scales, kernels and thresholds, in place, from traces X (n, C, T).
 
         `rng` draws the convolution kernels, and the traces that are read: at most 256 for the
@@ -297,7 +295,7 @@ class RocketEncoder(nn.Module):
         sample = X[torch.from_numpy(rng.permutation(len(X))[:FILTER_TRACES])]
         self.learn_filters(torch.addcmul(self.shift, sample, self.scale), rng)
 
-    def learn_filters(self, x: Tensor, rng: np.random.Generator) -> None:
+    def learn_filters(self, x: Tensor, rng: Generator) -> None:
         """Draw the kernels, and set their scales and thresholds from their outputs on traces.
 
         `x`, float32 (n, C, T), are traces whose channels the caller has scaled by `shift` and
@@ -379,7 +377,7 @@ def rocket_kernels() -> Tensor:
     return torch.full((84, TAPS), -1.0).scatter_(1, places, 2.0)
 
 
-def tap_positions(frames: int, dilations: int, places: int) -> NDArray[np.int64]:
+def tap_positions(frames: int, dilations: int, places: int) -> Ints:
     """Return the frame that each tap of a kernel reads, int64 (D, 9, P), for P places in a trace.
 
     A trace has `frames` frames, means of a few samples; a tap is one of the nine inputs of a
@@ -397,7 +395,7 @@ def tap_positions(frames: int, dilations: int, places: int) -> NDArray[np.int64]
     return np.where((taps < 0) | (taps >= frames), 2 * frames - 1, taps)
 
 
-def draw_kernels(channels: int, n: int, choices: Tensor, rng: np.random.Generator) -> Tensor:
+def draw_kernels(channels: int, n: int, choices: Tensor, rng: Generator) -> Tensor:
     """Draw n kernels from `choices` (N, 9), and the channels that each reads: float32 (n, C * 9).
 
     `rng` draws them. C is `channels`. Each of the N choices is drawn n / N times, rounded up or

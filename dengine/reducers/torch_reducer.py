@@ -28,6 +28,7 @@ from typing import Self
 
 import numpy as np
 import torch
+from numpy.random import Generator
 from sklearn.utils.validation import check_is_fitted
 from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812  # PyTorch's own documentation calls it so
@@ -90,7 +91,7 @@ class Augmentation:
     noise: float
     mixup: float
 
-    def __call__(self, x: Tensor, y: Tensor, rng: np.random.Generator) -> tuple[Tensor, Tensor]:
+    def __call__(self, x: Tensor, y: Tensor, rng: Generator) -> tuple[Tensor, Tensor]:
         """Augment a batch: shift, scale, add noise, mix; return new tensors.
 
         A shifted trace repeats its end frame. A trace is mixed with the one before it in the batch,
@@ -675,7 +676,7 @@ class TorchReducer(ProbabilityReducer):
 
 
 def draw_batches(
-    folds: Ints, n_folds: int, batch_size: int, steps: int, rng: np.random.Generator
+    folds: Ints, n_folds: int, batch_size: int, steps: int, rng: Generator
 ) -> Iterator[Tensor]:
     """Yield, for each step, the rows on which each of K networks is trained.
 
@@ -731,7 +732,7 @@ def warm_optimizer() -> None:
     torch.optim.AdamW([weight], fused=True).step()
 
 
-def standard_normal(rng: np.random.Generator, *shape: int) -> Tensor:
+def standard_normal(rng: Generator, *shape: int) -> Tensor:
     """Draw a float32 tensor of this shape from the standard normal distribution, by `rng`."""
     return torch.from_numpy(rng.standard_normal(shape, dtype=np.float32))
 

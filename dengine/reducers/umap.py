@@ -143,7 +143,7 @@ class UmapEncoder(nn.Module):
         """
         # Half the squared distances, less half the squared norm of each trace.
         half_squared = self.half_norms - frames @ self.references.T
-        nearest = half_squared.topk(self.n_neighbors, 1, False, True)[1]
+        nearest = half_squared.topk(self.n_neighbors, 1, False)[1]
         offsets = self.references[nearest] - frames.unsqueeze(1)
         strengths = self.strengths(offsets.square().sum(2).sqrt())
         points = self.points[nearest]
@@ -430,14 +430,14 @@ class UmapReducer(Reducer):
         """
         last_rows = self.neighbors_.rows_of(neighbors.numbers)
         is_old = last_rows >= 0
-        if 2 * int(is_old.sum()) < len(last_rows):
+        if 2 * is_old.sum() < len(last_rows):
             self.n_epochs_ = 0
             return spectral_start(graph, neighbors.frames, self.n_components, rng)
         points = torch.empty(len(last_rows), self.n_components)
         points[is_old] = self.embedding_[last_rows[is_old]]
         chunks = torch.split(neighbors.frames[~is_old], CHUNK)
         new_points = torch.cat([self.encoder_.embed_frames(frames) for frames in chunks])
-        noise = rng.normal(scale=NOISE, size=(int((~is_old).sum()), self.n_components))
+        noise = rng.normal(scale=NOISE, size=new_points.shape)
         points[~is_old] = new_points + torch.from_numpy(noise).float()
         return points
 

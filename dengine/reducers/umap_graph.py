@@ -157,8 +157,8 @@ class Neighbors:
         n = len(numbers)
         k = self.indices.size(1)
         old_rows = self.rows_of(numbers)  # -1: the trace is new
-        kept_rows = (old_rows >= 0).nonzero()[:, 0]
-        new_rows = (old_rows < 0).nonzero()[:, 0]
+        kept_rows = (old_rows >= 0).nonzero().flatten()
+        new_rows = (old_rows < 0).nonzero().flatten()
         old_rows = old_rows[kept_rows]
 
         frames = torch.empty(n, self.frames.size(1))
@@ -173,11 +173,11 @@ class Neighbors:
         distances[kept_rows] = self.distances[old_rows]
 
         complete = (indices >= 0).all(1) & (2 * len(new_rows) <= n)
-        for rows in torch.split((~complete).nonzero()[:, 0], CHUNK):
+        for rows in torch.split((~complete).nonzero().flatten(), CHUNK):
             candidates = nearest_rows(frames, rows, min(k + SPARE, n - 1))
             indices[rows], distances[rows] = nearest_candidates(frames, rows, candidates, k)
         if len(new_rows):
-            for rows in torch.split(complete.nonzero()[:, 0], CHUNK):
+            for rows in torch.split(complete.nonzero().flatten(), CHUNK):
                 near, nearest_new = nearest_new_rows(frames, rows, new_rows, distances[rows, -1])
                 rows = rows[near]
                 candidates = torch.cat([indices[rows], nearest_new[:, :k]], 1)
@@ -243,7 +243,7 @@ def nearest_candidates(
         Nearest first.
     """
     offsets = frames[candidates] - frames[rows].unsqueeze(1)
-    nearest = torch.linalg.vector_norm(offsets, dim=2).topk(k, dim=1, largest=False, sorted=True)
+    nearest = torch.linalg.vector_norm(offsets, dim=2).topk(k, dim=1, largest=False)
     return candidates.gather(1, nearest.indices), nearest.values
 
 

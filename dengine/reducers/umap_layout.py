@@ -81,7 +81,7 @@ def spectral_start(
     if points is None:
         points = principal_components(frames, n_components)
     points = points - points.mean(0)
-    points = points * (EXTENT / max(float(np.abs(points).max()), 1e-12))
+    points = points * (EXTENT / max(np.abs(points).max(), 1e-12))
     noise = rng.normal(scale=NOISE, size=points.shape)
     return torch.from_numpy((points + noise).astype(np.float32))
 
