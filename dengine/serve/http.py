@@ -340,8 +340,8 @@ class HttpApi:
         """
         status = await self.service.status(watch)
         line = {name: getattr(self.service, name) for name in api.LINE}
-        texts = {"alarm": status.alarm, "claim": status.certificate.sentence}
-        return response_fields("Status", status, **texts, **line)
+        claim = status.certificate.sentence
+        return response_fields("Status", status, alarm=status.alarm, claim=claim, **line)
 
     async def decision(self, id_: Id) -> StoredDecision:
         """Return one decision with its label; 404 for an unknown id, 422 for an invalid one, 503 if
@@ -413,8 +413,9 @@ class HttpApi:
         fewer. At most the newest 120 stretches with decisions are returned, but all retrains of the
         robot cell. 503: the queue is full, or the store cannot be read.
         """
-        by = {"seconds": 3600.0 * hours, "start": 3600.0 * start}
-        return await self.service.read(lambda store: read_course(store, **by))
+        return await self.service.read(
+            lambda store: read_course(store, seconds=3600.0 * hours, start=3600.0 * start)
+        )
 
     async def embedding(self) -> PartMap:
         """Return where parts lie in the model's embedding, in two dimensions.
@@ -432,8 +433,9 @@ class HttpApi:
         first; a version that is kept can be rolled back to. 503: the queue is full, or the store
         cannot be read.
         """
-        versions = await self.service.read(lambda store: store.versions.all())
-        return response_fields("Versions", versions=versions)
+        return response_fields(
+            "Versions", versions=await self.service.read(lambda store: store.versions.all())
+        )
 
     async def events(self, limit: Limit = 20) -> Json:
         """Return the newest events, such as changes by hand, safe modes and faults, and who caused
