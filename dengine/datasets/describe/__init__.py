@@ -153,22 +153,23 @@ def likely_endings(names: Strings) -> Strings:
     """Return the endings of these file names of which one may tell recordings from other files.
 
     They are the suffixes that more than a fifth as many files have as the most frequent one, and
-    `.mcap` even if only one file has it. Those that dengine does not read (`FOREIGN`) count only if
-    more files have them than any other. If there is only one, and the files are one for each part
-    and signal, like `1_Kraft.csv` and `1_Weg.csv`, the endings of the signals, `Kraft.csv` and
-    `Weg.csv`, come before it. Such an ending is what stands behind the last `-`, `_` or blank of a
-    name, and the part is what stands before. There must be at least two parts and two such endings,
-    and each part must have a file with each ending. If any ending is a word like `ok` or `pending`,
-    none counts. If any has a digit, they count only if there are 2 to 4 endings and 10 parts or
-    more: they are then numbered pieces of a part's curve.
+    `.mcap` even if only one file has it; beside such a file they need two. Those that dengine does
+    not read (`FOREIGN`) count only if more files have them than any other. If there is only one,
+    and the files are one for each part and signal, like `1_Kraft.csv` and `1_Weg.csv`, the endings
+    of the signals, `Kraft.csv` and `Weg.csv`, come before it. Such an ending is what stands behind
+    the last `-`, `_` or blank of a name, and the part is what stands before. There must be at least
+    two parts and two such endings, and each part must have a file with each ending. If any ending
+    is a word like `ok` or `pending`, none counts. If any has a digit, they count only if there are
+    2 to 4 endings and 10 parts or more: they are then numbered pieces of a part's curve.
     """
     counts = Counter(map(suffix_of, names))
     most = max(counts.values())
     readable = max(counts[suffix] for suffix in SUFFIXES)
+    least = 2 if BAG in counts else 1  # a single file beside a bag is a listing
     likely = [
         suffix
         for suffix, n in counts.items()
-        if (n * FEW > most and (suffix in SUFFIXES or n > readable)) or suffix == BAG
+        if suffix == BAG or (n >= least and n * FEW > most and (suffix in SUFFIXES or n > readable))
     ]
     words = [re.split(r"[-_ ](?=[^-_ /]+$)", name) for name in names]
     n_parts = len({name[0] for name in words})
