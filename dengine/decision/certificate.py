@@ -338,7 +338,7 @@ class Certificate:
         would have cost, what bad parts cost at most, rounded up to a whole number, and the
         difference, rounded down: what was saved at least or, if it is not above 0, lost at most.
         These costs are missing if the bound is 1 or all parts were checked. With prices the last
-        sentence says when accepting pauses.
+        sentence says at which loss accepting pauses: parts are then checked instead.
         """
         claim = self._claim(
             self.accepted,

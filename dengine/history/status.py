@@ -574,8 +574,9 @@ def bad_accepts(outcomes: Outcomes, policy: Policy) -> ErrorEstimate:
     Returns
     -------
     ErrorEstimate
-        Share, interval at the policy's alpha, and verdict. If no part was accepted, like in shadow
-        mode (every part is checked), its `n` is 0, even if parts were audited; see
+        Share, interval at the policy's alpha, and verdict: whether the interval is below the
+        tolerance ("kept"), above ("broken") or neither ("open"). If no part was accepted, like in
+        shadow mode (every part is checked), its `n` is 0, even if parts were audited; see
         `Span.would_accept` then.
     """
     tolerance = policy.tolerances[0]

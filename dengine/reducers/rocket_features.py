@@ -301,7 +301,8 @@ class RocketEncoder(nn.Module):
         `x`, float32 (n, C, T), are traces whose channels the caller has scaled by `shift` and
         `scale`, which must be set before. It writes `kernel`, `threshold` and, if there are groups
         of competing kernels, `competing_kernel`. `rng` draws the kernels of the two towers (groups
-        of features): MiniRocket's for tower 1, normal weights less their mean for tower 2.
+        of features): MiniRocket's for tower 1, normal weights less their mean for tower 2. It also
+        draws the channels that each kernel reads.
 
         Only tower 1 has thresholds; they are quantiles of a kernel's outputs, from 5 to 95 %. Its
         kernels are scaled so that the ramp around the threshold, on which the answer of a kernel

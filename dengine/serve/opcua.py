@@ -286,13 +286,14 @@ class AddressSpace:
     async def refresh(self) -> None:
         """Read the cell's status and write it into the OPC UA variables.
 
-        The status has counts of decisions, the safe mode, the alarm and the like. An OPC UA event
-        is sent if the text of the alarm has changed (`write_status`). If the status cannot be read
-        or written, or the event cannot be sent, a warning is logged and no error is raised. All
-        variables of the status then get the OPC UA status code UncertainLastUsableValue, which
-        marks them as old; those written before the error keep the new values, the others their old
-        ones. The variable LastRefused (why the last call was refused) is not part of the status,
-        and stays as it is. An error while the variables are marked is raised.
+        The status has counts of decisions, the alarm, the safe mode (parts are checked until new
+        outcomes allow decisions again) and the like. An OPC UA event is sent if the text of the
+        alarm has changed (`write_status`). If the status cannot be read or written, or the event
+        cannot be sent, a warning is logged and no error is raised. All variables of the status then
+        get the OPC UA status code UncertainLastUsableValue, which marks them as old; those written
+        before the error keep the new values, the others their old ones. The variable LastRefused
+        (why the last call was refused) is not part of the status, and stays as it is. An error
+        while the variables are marked is raised.
         """
         try:
             await self.write_status(await self._calls.status())

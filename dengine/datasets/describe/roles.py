@@ -71,7 +71,8 @@ def propose_roles(p: Proposal) -> None:
     `[rows]` gets further columns and words (`qualify_rows`, `find_lost`). `p.columns` is set, and
     `p.tables` loses rows that are no samples. Raises DataError if a stated column of times or
     channel does not exist, a setting in `[time]` is wrong, a stated source of labels has no words
-    or cannot be read, or cells are lists, and SettingError for a malformed `windows.trigger`.
+    (like `ok`) or cannot be read, or cells are lists, and SettingError for a malformed
+    `windows.trigger`.
     """
     p.columns = columns_of(p.tables, p.description.text)
     for name in (*p.description.time.column, *p.description.channels):
@@ -305,7 +306,7 @@ def find_lost(p: Proposal) -> None:
 
     `p` is the description so far. The words are those already there, and those of `LOST`, like
     `nan`, `-` or the empty cell, that a channel has, in any case of letters. If another text is in
-    more than 1 % of a channel's cells, or if a cell of a text file has a number like -9999 or 1e30,
+    more than 1 % of a channel's cells, or if one of them has a number like -9999 in a text file,
     `text.missing` is `?`, with a note. If more than 10 % of the cells of a channel are empty, "" is
     not added for it if `time.column` is set, even to `?`: these rows belong to another signal.
     `[rows]`, the section on which rows are samples, then drops them, unless it has words of this
