@@ -372,7 +372,9 @@ class Certificate:
     def sentence_on_rejects(self) -> str:
         """The claim about rejected parts as one sentence: what share of them was good at most.
 
-        It also names the confidence, and the tolerance or, if the policy decides by prices, the
+        It is about all parts that the model would reject, and says how many of them were audited
+        (checked at random), or that each was checked. It also names the confidence, and the
+        tolerance, the share that may be decided wrongly, or, if the policy decides by prices, the
         share up to which rejecting pays. If nothing can be claimed, it says so, and why.
         """
         return self._claim(

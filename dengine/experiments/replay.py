@@ -139,8 +139,9 @@ class Contender:
     def engine(self, seed: int, trace: TraceSpec | None = None) -> DataEngine:
         """Return a new engine, with its store in memory, for this contender's recipe or baseline.
 
-        A baseline is a method to compare with; it is the model of the engine. `trace` is the shape,
-        rate and units of the traces; None: the first trace sets it. A training ends after a number
+        A recipe is all settings of an engine. A baseline is a method to compare with; it is the
+        model of the engine, whose other settings are the recipe's. `trace` is the shape, rate and
+        units of the traces; None: the first trace sets it. A training ends after a number
         of steps and not by the time budget, so that the same seed gives the same decisions. The
         call limits this thread to one torch thread. Raises SettingError for settings that
         `DataEngine` refuses, such as force limits in seconds at an unknown rate, and for a baseline

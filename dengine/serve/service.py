@@ -67,8 +67,8 @@ class Job(NamedTuple):
         """Do the work with the engine, and set the future's result or exception.
 
         If the future was cancelled, because its caller timed out or was cancelled, the work is told
-        so, and done all the same (a decision is then VERIFY, without asking the model); its result
-        is dropped, and an exception is logged. Nothing is raised.
+        so, and done all the same (a decision is then VERIFY, to check the part, without asking the
+        model); its result is dropped, and an exception is logged. Nothing is raised.
         """
         has_caller = self.future.set_running_or_notify_cancel()
         try:

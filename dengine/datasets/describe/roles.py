@@ -102,10 +102,11 @@ def propose_roles(p: Proposal) -> None:
 def set_rows(p: Proposal, rows: RowMeanings) -> None:
     """Set `[rows]` in `p`, and leave the rows that are no samples out of its tables and columns.
 
-    A recording keeps all rows if it lacks a column of `rows`, or has a word without a meaning
-    there; all of them do while a `keep` is `?`. But a recording with one cell in such a column is
-    left out as a whole if the word of this cell drops it; if that leaves out all recordings, all of
-    them stay, with all rows. Nothing changes if `rows` is empty.
+    `rows` has, by column, the words that keep a row (`keep`; `?` while that is open), drop it, or
+    mark its samples as lost. A recording keeps all rows if it lacks a column of `rows`, or has a
+    word without a meaning there; all of them do while a `keep` is `?`. But a recording with one
+    cell in such a column is left out as a whole if the word of this cell drops it; if that leaves
+    out all recordings, all of them stay, with all rows. Nothing changes if `rows` is empty.
     """
     if rows:
         p.description = replace(p.description, rows=rows)
