@@ -462,7 +462,7 @@ class Description:
             if any(f"{section}.{source}" in stated for source in SOURCES):
                 for source in SOURCES:
                     values.get(section, {}).pop(source, None)
-        for name, value in deepcopy(dict(stated)).items():
+        for name, value in deepcopy(stated).items():
             of_column = OF_COLUMN.fullmatch(name)
             *steps, last = of_column.groups() if of_column else name.split(".", 1)
             table = values

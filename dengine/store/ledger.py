@@ -335,7 +335,7 @@ class LedgerEntry:
         """
         if not (self._sums or self.settings):
             return None
-        chains = self._chains
+        chains = dict(self._chains)
         for name in IN_FORCE:
             if name in self._sums:
                 chains[name] = _extend_chain(chains.get(name, ""), self._sums[name])

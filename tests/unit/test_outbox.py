@@ -124,6 +124,14 @@ def test_a_journal_that_is_made_again_over_a_longer_file_keeps_no_record_of_it(t
             assert (found.loss, records) == ("", [b"a record"])
 
 
+def test_a_host_whose_name_is_not_ascii_has_a_journal_with_a_whole_header(tmp_path, monkeypatch):
+    monkeypatch.setattr("socket.gethostname", lambda: "Ж" * 60)
+    with closing(Journal(tmp_path / "cell.journal")) as journal:
+        journal.append([b"a record"], 0.0)
+        with closing(Journal(journal.path, owning=False)) as found:
+            assert (found.loss, len([*found.undrained_records()])) == ("", 1)
+
+
 @pytest.fixture(params=["memory", "file"])
 def either(request, tmp_path):
     """An outbox of each kind."""

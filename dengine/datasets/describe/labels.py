@@ -60,6 +60,8 @@ PLACES = (  # of any words: folders, and the words of a file's name, counted fro
     "([^-_ /]+)(?:[-_ ][^-_ /]*){3}$",
     "(?:^|/)([^-_ /]+)[^/]*$",
 )
+# What ends the beginning of a line: a mark, two blanks, or the blank before a date.
+NAME_END = re.compile(r"[;:：=\t,]|  |(?<=[^\W\d]) (?=\d+[-./]\d+[-./]\d)")
 LISTED = re.compile(r"\((?!\?)(?:[\w /|-]|\\\W)+\)")  # a group of words, with escaped marks
 OWN = ("npz", "y", (), {"0", "1"})  # labels as dengine's own archives have them
 NO_LABEL = "none was found that is certain: state label.column, path, line or listing"
@@ -158,9 +160,7 @@ def lines_of(p: Proposal) -> list[str]:
     comes once; empty ones are left out.
     """
     beginnings = [
-        re.split(r"[;:：=\t,]|  |(?<=[^\W\d]) (?=\d+[-./]\d+[-./]\d)", line.lstrip("#%* \t\"'"))[
-            0
-        ].strip(" \"'")
+        NAME_END.split(line.lstrip("#%* \t\"'"))[0].strip(" \"'")
         for table in p.tables[:1]
         for line in table.above
     ]

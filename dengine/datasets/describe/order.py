@@ -13,11 +13,11 @@ import numpy as np
 from ...errors import DataError, listed
 from ..description import UNKNOWN, Clock, LabelSource, Strings, TextForm
 from ..read.clock import has_day, times_of
-from ..read.files import DATE, HALF_DAY, UNSORTED, natural_key, sort_key
+from ..read.files import HALF_DAY, file_key, is_unsorted, natural_key, sort_key
 from ..read.places import listing_table, stem_of
 from ..table import Table
 from .columns import Column, Proposal, Tables
-from .labels import lines_of, part_words, tables_of, words_of
+from .labels import Words, lines_of, part_words, tables_of, words_of
 
 STAMP_NAME = re.compile(r"(?i)stamp|created|date|datum|epoch")
 STAMP_WORD = re.compile(r"(.*\d){5}")
@@ -31,7 +31,6 @@ MARK = re.compile(r"[-_. :T/]?")  # between the numbers of a date
 DAY_FIRST = re.compile(
     r"[0-3]?\d[0-3]\d(20)?[0-4]\d[0-2]\d[0-5]\d([0-5]\d)?|[0-3]?\d[0-3]\d20[0-4]\d"
 )
-FRONT = "a number, or year, month and day in front"
 FEW = 0.15  # of the times of day that may be smaller than the one before, on the next day
 
 
@@ -53,12 +52,9 @@ def propose_order(p: Proposal) -> None:
     about = p.description
     tables = tables_of(p)
     stems = {table.path: stem_of(about, table.path) for table in tables}
-    names = {
-        path: f"{stem.rpartition('/')[2]} {stem}" for path, stem in stems.items()
-    }  # then the folders
-    by_name = [*stems]
-    if about.layout != "columns":
-        by_name.sort(key=lambda path: natural_key(path.rpartition("/")[2]))
+    # The numbers in folders may contradict those in the names.
+    names = {path: f"{stem.rpartition('/')[2]} {stem}" for path, stem in stems.items()}
+    by_name = [*stems] if about.layout == "columns" else sorted(stems, key=file_key)
     by_path = sorted(stems, key=lambda path: natural_key(stems[path]))
     proved = {
         order: files
@@ -71,17 +67,23 @@ def propose_order(p: Proposal) -> None:
         if proved and all(other == files for other in proved.values()):
             p.put("order", next(iter(proved)))
         else:
-            text = f"name: by file name, or path: folder by folder; {listed(by_name[:3])} prove"
-            p.put("order", UNKNOWN, f"{text} neither. If both are wrong, rename the files: {FRONT}")
+            p.put(
+                "order",
+                UNKNOWN,
+                f"name: by file name, or path: folder by folder; {listed(by_name[:3])} prove "
+                "neither. If both are wrong, rename the files: a number, or year, month and day in "
+                "front",
+            )
     places = {path: place for place, path in enumerate(files)}
     tables.sort(key=lambda table: places[table.path])
-    numbers = [*part_words(p.description.part, tables).values()]
+    parts = part_words(about.part, tables)
+    numbers = [*parts.values()]
     rising = sorted(numbers, key=natural_key)
     is_odd = numbers in (sorted(numbers), rising[::-1]) or counter_of(numbers)
     if numbers != rising and is_odd:
-        name = listed(p.description.part.column) or "path"
+        name = listed(about.part.column) or "path"
         p.put("order", UNKNOWN, f"name, or {name}: the part numbers have another order")
-    for source in falling_stamps(p, tables):
+    for source in falling_stamps(p, tables, parts):
         place = source.column or source.line
         other = place if source.column and not source.listing else "rename the files"
         p.put("order", UNKNOWN, f"name, or {other}: {place} has another order")
@@ -134,7 +136,7 @@ def counter_of(words: Strings) -> list[int]:
     return []
 
 
-def falling_stamps(p: Proposal, tables: Tables) -> Iterator[LabelSource]:
+def falling_stamps(p: Proposal, tables: Tables, parts: Words) -> Iterator[LabelSource]:
     """Yield each place with a date, time or counter for each recording, that is out of order.
 
     The places are columns without another use, lines above the header of the first table, and
@@ -147,13 +149,12 @@ def falling_stamps(p: Proposal, tables: Tables) -> Iterator[LabelSource]:
     a date may begin again. Empty words are left out. `p` is the description so far. Raises
     SettingError for a malformed `windows.trigger`, the condition at which a part begins.
 
-    tables : the table of each recording, in the order to be compared.
+    tables : the table of each recording, in the order to be compared. parts : their part numbers.
     """
-    parts = part_words(p.description.part, tables)
     sources = [LabelSource(column=column.name, at="first") for column in p.unused]
     sources += [LabelSource(line=line) for line in lines_of(p)]
     for label in p.description.labels:
-        with suppress(DataError):
+        with suppress(DataError):  # a label in no listing, or in one that cannot be read
             listing = listing_table(p.base / label.listing, p.description.text)
             sources += [replace(label, column=name) for name in listing.columns]
     for source in sources:
@@ -169,8 +170,8 @@ def falling_stamps(p: Proposal, tables: Tables) -> Iterator[LabelSource]:
 def stamps_of(words: Strings, is_named: bool) -> Iterator[list[Any]]:
     """Yield what words are sorted by if they are dates or times, for each form that fits.
 
-    Nothing is yielded for other words. Times of day of which few are smaller than the one before
-    are sorted already.
+    Nothing is yielded for other words. Times of day without a date are yielded in order if few
+    are smaller than the one before: the next day begins.
 
     is_named : whether the place of the words is named like a date or time.
     """
@@ -180,8 +181,7 @@ def stamps_of(words: Strings, is_named: bool) -> Iterator[list[Any]]:
         with suppress(DataError):  # a word far behind may be no time
             times = times_of(cells, Clock(("",), (form,)), TextForm()).tolist()
             n_falls = sum(a > b for a, b in pairwise(times))
-            yield times if has_day(form) or n_falls > FEW * len(times) else []
-    is_plain = is_named and not any(UNSORTED.search(DATE.sub("", word)) for word in words)
-    is_stamp = is_plain or all(map(STAMP.fullmatch, words))
+            yield times if has_day(form) or n_falls > FEW * len(times) else sorted(times)
+    is_stamp = all(map(STAMP.fullmatch, words)) or (is_named and not any(map(is_unsorted, words)))
     if is_stamp and not forms and all(map(STAMP_WORD.match, words)):
         yield [*map(sort_key, words)]

@@ -90,7 +90,8 @@ def propose_roles(p: Proposal) -> None:
         if clock.column and UNKNOWN not in clock.column + clock.format:
             propose_rate(p, p.tables)
         propose_lengths(p)
-    if p.description.order == "name" and UNKNOWN not in clock.column:
+    is_open = p.description.order == "name" and "order" not in p.stated
+    if is_open and UNKNOWN not in clock.column:
         propose_order(p)
     listings = {source.listing for source in p.description.labels}
     others = sorted({*p.others} - listings, key=natural_key)
@@ -209,18 +210,23 @@ def propose_part(p: Proposal) -> None:
     `windows.trigger`.
     """
     about = p.description
+    if about.part != PartSource():
+        return
     counts = {
         source: len({*part_words(source, p.tables).values()})
         for source in sources_named(p, PART_NAME, PART_LINE)
-        if about.part == PartSource()
     }
     many = [source for source, n in counts.items() if n > len(p.tables) / 2]
     names = [source.line or source.column[0] for source, n in counts.items() if n > 1]
     if len(many) == 1:
         p.description = replace(about, part=many[0])
     elif names and about.layout == "wide" and not (many or about.rows):
-        text = f"{listed(names)}, or []: is a number in several rows a part that came again?"
-        p.put("part.column", UNKNOWN, f"{text} Pieces of a curve must be joined first")
+        p.put(
+            "part.column",
+            UNKNOWN,
+            f"{listed(names)}, or []: is a number in several rows a part that came again? Pieces "
+            "of a curve must be joined first",
+        )
 
 
 def propose_channels(p: Proposal, units: Mapping[str, str]) -> None:

@@ -36,6 +36,19 @@ def natural_key(text: str) -> list[Any]:
     return pieces
 
 
+def file_key(path: str) -> tuple[list[Any], list[Any]]:
+    """Return the key by which files are in the order `name`: by file name, then by path."""
+    return natural_key(Path(path).name), natural_key(path)
+
+
+def is_unsorted(word: str) -> bool:
+    """Return whether a word has a date with the day or the month first, or a time with AM or PM.
+
+    `sort_key` does not put such words in order; dates like 31.12.2025 are no such words.
+    """
+    return UNSORTED.search(DATE.sub("", word)) is not None
+
+
 def sort_key(word: str) -> list[Any]:
     """Return a key that sorts decimal numbers by their value, and other words as `natural_key`."""
     return ["", float(word), ""] if DECIMAL.fullmatch(word) else natural_key(word)
@@ -93,7 +106,7 @@ def find_files(root: Path, description: Description) -> list[str]:
             f"Expected files {', '.join(description.files)} in {root}, found none; is it the "
             f"description of another folder? See `dengine data {root}`."
         )
-    return sorted(names, key=lambda name: (natural_key(Path(name).name), natural_key(name)))
+    return sorted(names, key=file_key)
 
 
 def read_file(path: Path) -> bytes:

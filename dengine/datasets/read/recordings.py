@@ -22,7 +22,7 @@ from ..table import Recording, Table, UnreadableError, as_word
 from ..units import bare, conversion, unit_in
 from .bags import read_bag
 from .clock import check_steps, times_of
-from .files import DATE, UNSORTED, caught, find_files, natural_key, read_file, sort_key
+from .files import caught, find_files, is_unsorted, natural_key, read_file, sort_key
 from .frames import read_frame
 from .places import LabelReader, part_of, read_labels, stem_of
 from .split import split, table_of
@@ -96,8 +96,9 @@ def recording_of(
         rank = natural_key(stem_of(description, table.path))
     elif order not in ORDERS:
         rank = sort_key(word := table.one_word(order, "first"))
-        is_unsorted = UNSORTED.search(DATE.sub("", word)) is not None
-        table.refuse(np.array([is_unsorted]), "dates to sort by, with the year in front", order)
+        table.refuse(
+            np.array([is_unsorted(word)]), "dates to sort by, with the year in front", order
+        )
     return Recording(
         table.source,
         fitted(np.stack(samples), seconds, description),

@@ -119,8 +119,14 @@ def longest_list(table: Table) -> int:
     Of a list of lists all items count. 0 if none of these cells is a list with items.
     """
     cells = [column[0] for column in table.columns.values() if len(column)]
-    lists = [cell for cell in cells if isinstance(cell, frames.ITEMS) and len(cell)]
-    return max((len(cell) * np.size(cell[0]) for cell in lists), default=0)
+    return max(
+        (
+            len(cell) * np.size(cell[0])
+            for cell in cells
+            if isinstance(cell, frames.ITEMS) and len(cell)
+        ),
+        default=0,
+    )
 
 
 def _split_rows(table: Table, description: Description) -> Iterator[Table]:

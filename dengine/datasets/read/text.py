@@ -231,9 +231,8 @@ def _read_strictly(content: bytes, table: Table, form: TextForm) -> Table:
     rows = dict[int, list[str]]()
     damage = list[UnreadableError]()
     lines = content.decode().split("\n")
-    while lines and not lines[-1].strip(
-        f" \t{form.delimiter}"
-    ):  # a spreadsheet's empty rows at the end
+    blanks = f" \t{form.delimiter}"  # all that a spreadsheet's empty rows at the end have
+    while lines and not lines[-1].strip(blanks):
         lines.pop()
     for i, line in enumerate(lines, 1):
         if i >= table.lines[0] and line.strip() and not line.startswith(form.drop):
