@@ -98,7 +98,7 @@ def with_meanings(source: LabelSource, words: Names) -> LabelSource:
 
 
 def lists_words(source: LabelSource) -> bool:
-    """Return whether the group of `source.path` lists its words, like `(ok|nok)`, not `([^/]+)`."""
+    """Return whether a group in `source.path` spells out its words: `(ok|nok)`, not `([^/]+)`."""
     return LISTED.search(source.path) is not None
 
 

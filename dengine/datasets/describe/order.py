@@ -37,17 +37,18 @@ FEW = 0.15  # of the times of day that may be smaller than the one before, on th
 def propose_order(p: Proposal) -> None:
     """Set `order` in `p` to what is certain: `name`, `path`, or else `?`, with a note.
 
-    `p` is the description so far. `name` means by file name, and `path` folder by folder, without
-    words that are labels. An order is certain if the names or paths in it, both without such words,
-    prove it (`counts_parts`); if both do, it must be the same. In the layout `columns` the columns'
-    names count in place of files, as they stand. While `label.column` is `?`, names are not looked
-    at.
+    `p` is the description so far. `name` sorts by file name as it stands, and `path` by the path
+    without words that are labels. An order is certain if its texts without such words prove it
+    (`proves_order`): for `name` the file name and then the path, for `path` the path. If both
+    orders are certain and the same, it is `name`; if they differ, it is `?`. In the layout
+    `columns` the columns' names count in place of files, as they stand. While `label.column` is
+    `?`, names are not looked at.
 
-    `order` is also `?` if the part numbers fall, are sorted as texts (P10 before P2) or are
-    counters that do not rise, or if a date, time or counter of each recording does not rise
-    (`falling_stamps`). If several of these hold, the note is on the last. An `order` that the user
-    stated stays. Raises SettingError for a malformed `windows.trigger`, the condition at which long
-    recordings are cut.
+    In this order, or by name if none is certain, parts are then compared. `order` is also `?` if
+    the part numbers fall throughout, are sorted as texts (P10 before P2) or are counters that do
+    not rise, or if a date, time or counter of each recording does not rise (`unsorted_stamps`). If
+    several of these hold, the note is on the last. An `order` that the user stated stays. Raises
+    SettingError for a malformed `windows.trigger`, the condition at which long recordings are cut.
     """
     about = p.description
     tables = tables_of(p)
@@ -59,7 +60,7 @@ def propose_order(p: Proposal) -> None:
     proved = {
         order: files
         for order, files, texts in (("name", by_name, names), ("path", by_path, stems))
-        if counts_parts([texts[path] for path in files])
+        if proves_order([texts[path] for path in files])
     }
     files = [*proved.values(), by_name][0]
     # While it is open where the label stands, any folder or word may be one of a verdict.
@@ -83,21 +84,22 @@ def propose_order(p: Proposal) -> None:
     if numbers != rising and is_odd:
         name = listed(about.part.column) or "path"
         p.put("order", UNKNOWN, f"name, or {name}: the part numbers have another order")
-    for source in falling_stamps(p, tables, parts):
+    for source in unsorted_stamps(p, tables, parts):
         place = source.column or source.line
         other = place if source.column and not source.listing else "rename the files"
         p.put("order", UNKNOWN, f"name, or {other}: {place} has another order")
 
 
-def counts_parts(names: Strings) -> bool:
+def proves_order(names: Strings) -> bool:
     """Return whether names in their order prove that the parts were made in this order.
 
-    What they differ in first must belong to a date that begins with the year, or be a number,
-    another one in each name. A date goes on with numbers behind marks, like the time of day. It
-    must not fall in either case. If they differ in it first, names of one date must prove their
-    order, too. If they differ in a number first, this number must rise, and so must any other that
-    each name has, another one in each. Numbers with the day first (010324080000) and names with AM
-    or PM prove nothing. If all names are equal, no other order is possible: True.
+    The date is the first number that is a year from 2000 to 2049, or begins with one (20240131), in
+    all names, together with the numbers behind it if only marks like `-` or `/` stand between them.
+    Dates must never fall. If the names first differ in the date, the names of one date must prove
+    their order, too. If they first differ in another number, it must be distinct in each name and
+    rise, and so must any other number that is distinct in each. 31.12.2025 is read with the year
+    first; other numbers with the day first (010324080000), and AM and PM, prove nothing. If all
+    names are equal, no other order is possible.
     """
     if len({*names}) == 1:
         return True
@@ -112,7 +114,7 @@ def counts_parts(names: Strings) -> bool:
     first = next(i for i, row in enumerate(pieces) if len({*row}) > 1)
     if begin <= first <= end:
         days = groupby(zip(dates, names, strict=True), itemgetter(0))
-        return all(counts_parts([name for _, name in day]) for _, day in days)
+        return all(proves_order([name for _, name in day]) for _, day in days)
     numbers = pieces[1:begin:2] + pieces[end + 2 :: 2]
     counters = [row for row in numbers if "" not in row and len({*row}) == len(names)]
     is_odd = any([*row] != sorted(row) or fits_all(DAY_FIRST, row) for row in counters)
@@ -125,10 +127,11 @@ def fits_all(pattern: re.Pattern[str], pieces: Sequence[Any]) -> bool:
 
 
 def counter_of(words: Strings) -> list[int]:
-    """Return the first number in each word that counts them; empty if none does.
+    """Return the numbers by which words are counted, one of each; empty if there are none.
 
-    Each word must have it, another one in each, and they must be close: the largest is less than
-    twice as many above the smallest as there are words. There must be three words or more.
+    They stand at the first place, counted in runs of digits, at which each word has another number.
+    They count, in any order, if the largest is less than twice as many above the smallest as there
+    are words. No later place is tried. There must be three words or more.
     """
     for row in [*zip_longest(*map(natural_key, words), fillvalue="")][1::2]:
         if len(words) > 2 and "" not in row and len({*row}) == len(words):
@@ -136,18 +139,17 @@ def counter_of(words: Strings) -> list[int]:
     return []
 
 
-def falling_stamps(p: Proposal, tables: Tables, parts: Words) -> Iterator[LabelSource]:
+def unsorted_stamps(p: Proposal, tables: Tables, parts: Words) -> Iterator[LabelSource]:
     """Yield each place with a date, time or counter for each recording, that is out of order.
 
     The places are columns without another use, lines above the header of the first table, and
     columns of listings of labels. A recording's word is its text in a place; in a column of its
-    table, the cell of the first row. A place counts if its words are dates or times of a known form
-    (`Column.forms`) or numbers of seconds since 1970 (or ms, us, ns), if its name says so
-    (`timestamp`, `created`) and its words have five digits or more, or if it does not change within
-    a recording, and a number in its words counts the recordings (`counter_of`). Equal ones are in
-    order, and if several forms fit, one in which they are in order is enough. Times of day without
-    a date may begin again. Empty words are left out. `p` is the description so far. Raises
-    SettingError for a malformed `windows.trigger`, the condition at which a part begins.
+    table, the cell of the first row; empty ones are left out. A place counts if its words are dates
+    or times (`stamps_of`; its name may say so, like `timestamp` or `created`). Otherwise it counts
+    if it does not change within a recording, and a number in its words counts the recordings
+    (`counter_of`). Equal words are in order, and if several forms of dates fit, one in which they
+    are in order is enough. `p` is the description so far. Raises SettingError for a malformed
+    `windows.trigger`, the condition at which long recordings are cut.
 
     tables : the table of each recording, in the order to be compared. parts : their part numbers.
     """
@@ -170,8 +172,11 @@ def falling_stamps(p: Proposal, tables: Tables, parts: Words) -> Iterator[LabelS
 def stamps_of(words: Strings, is_named: bool) -> Iterator[list[Any]]:
     """Yield what words are sorted by if they are dates or times, for each form that fits.
 
-    Nothing is yielded for other words. Times of day without a date are yielded in order if few
-    are smaller than the one before: the next day begins.
+    If no form of dates and times fits, words are sorted as `sort_key` sorts them if all are like
+    numbers of seconds since 1970 or like 20240131_235959; also, in a place that is named like a
+    date or time, if all have five digits and none is `is_unsorted`. For others nothing is yielded.
+    Times of day without a date are yielded sorted if at most 15 % (`FEW`) are smaller than the one
+    before, because the next day begins.
 
     is_named : whether the place of the words is named like a date or time.
     """

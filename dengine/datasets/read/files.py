@@ -42,15 +42,20 @@ def file_key(path: str) -> tuple[list[Any], list[Any]]:
 
 
 def is_unsorted(word: str) -> bool:
-    """Return whether a word has a date with the day or the month first, or a time with AM or PM.
+    """Return whether a word has a date, or a time with AM or PM, that `sort_key` does not order.
 
-    `sort_key` does not put such words in order; dates like 31.12.2025 are no such words.
+    A date is three parts between equal marks (`-`, `.`, `/` or a blank), the first of one or two
+    digits, like 31.12.25 or 24-01-15. 31.12.2025 does not count, since `natural_key` reads it with
+    the year first.
     """
     return UNSORTED.search(DATE.sub("", word)) is not None
 
 
 def sort_key(word: str) -> list[Any]:
-    """Return a key that sorts decimal numbers by their value, and other words as `natural_key`."""
+    """Return a key that sorts decimal numbers by their value, and other words as `natural_key`.
+
+    Numbers with a sign or a negative exponent, like -5 and 1e-3, are such other words.
+    """
     return ["", float(word), ""] if DECIMAL.fullmatch(word) else natural_key(word)
 
 
