@@ -198,8 +198,9 @@ def _match_spec(x: TraceArray, trace_spec: TraceSpec) -> TraceArray:
     """Return traces (..., C, T) fitted to the number of samples of a `TraceSpec`.
 
     Traces of that length are returned as they are; of others a fitted copy is returned, as
-    `trace_spec.fit` says (cut, pad or resample; strict allows none). Raises TraceError for a length
-    that cannot be fitted so, and for another number of channels.
+    `trace_spec.fit` says (cut, pad or resample; strict allows none). Raises TraceError for another
+    number of channels and for a length that cannot be fitted so: cut takes no shorter traces, pad
+    and resample take those of half to twice that number of samples.
     """
     channels, samples = x.shape[-2:]
     if channels != trace_spec.channels:

@@ -105,10 +105,11 @@ def history(store: str, events: bool, **criteria: Any) -> None:
     corrected label), from the time of the first of these decisions on (if no decision fits, all),
     or from --since on, and before --until. In the table part has the last 10 characters of the
     part's number, model is what the model alone would have done, if that differs from the action,
-    good and bad are the numbers of labels nearby that were counted, bound is the interval of the
-    success probability that follows from them, v is the version of the model, and label is what the
-    part turned out to be. If there is nothing to list, a sentence says so. `dengine explain` tells
-    more about one decision.
+    as in an audit (a random check of a part of which the model is certain) or in shadow mode (every
+    part is checked), good and bad are the numbers of labels nearby that were counted, bound is the
+    interval of the success probability that follows from them, v is the version of the model, and
+    label is what the part turned out to be. If there is nothing to list, a sentence says so.
+    `dengine explain` tells more about one decision.
     """
     from ..history.status import history as read_history
     from ..representation import to_jsonable

@@ -417,11 +417,11 @@ def _print_run(replay: Replay, record: Record, cell: Any, out: Out | None) -> No
 def _stretch_cells(stretch: Mapping[str, Any], total: Mapping[str, Any]) -> dict[str, str]:
     """Return a table row, title -> cell, for the counts of a stretch of cycles.
 
-    A stretch is a number of consecutive cycles. `stretch` and `total`, the counts of the whole run,
-    are as `Replay.stretch` returns them. The cells are its first and last cycle, the share of
-    verified parts in whole percent, and the counts in `COLUMNS`, such as accepted, rejected and
-    wrongly decided parts and line stops. Parts outside the force limits that an operator set have
-    no column if there were none in the whole run.
+    A stretch is a number of consecutive cycles, and a cycle handles one part. `stretch` and
+    `total`, the counts of the whole run, are as `Replay.stretch` returns them. The cells are its
+    first and last cycle, the share of verified parts in whole percent, and the counts in `COLUMNS`,
+    such as accepted, rejected and wrongly decided parts and line stops. Parts outside the force
+    limits that an operator set have no column if there were none in the whole run.
     """
     cells = {
         "cycles": f"{stretch['first_cycle']} to {stretch['last_cycle']}",

@@ -119,12 +119,13 @@ def _present_rows(report: "Status") -> Iterator[tuple[str, str]]:
     They are the robot cell; the fields of the status that are not empty, except those that other
     rows or another table show (`SHOWN_ELSEWHERE`) and those that only a running engine knows; the
     recipe (all settings of the engine); the `TraceSpec` (shape, rate and unit of traces); two
-    sentences of the certificate, with the largest shares of wrong decisions on accepted and on
-    rejected parts; the last and the slowest retrain; and the newest events, with a row for each,
-    the newest first. An alarm, or a retrain, has a row only if there is one. The recipe is left out
-    if the model was handed in by the user, because the recipe has no effect on it. If the policy
-    has no audits (checks of parts of which the model is certain), the counts with the name "audit"
-    are called "certain but checked": they come from shadow mode, in which every part is verified.
+    sentences of the certificate, which bound the shares of the accepted and of the rejected parts
+    that were decided wrongly; the last and the slowest retrain; and the newest events, with a row
+    for each, the newest first. An alarm, or a retrain, has a row only if there is one. The recipe
+    is left out if the model was handed in by the user, because the recipe has no effect on it. If
+    the policy has no audits (checks of parts of which the model is certain), the counts with the
+    name "audit" are called "certain but checked": they come from shadow mode, in which every part
+    is verified.
     """
     if report.alarm:
         yield "look at", report.alarm

@@ -486,14 +486,15 @@ class DataEngine(AbstractContextManager["DataEngine"]):
 
         A training that is not done 5 s after this call is dropped. In a product (robot cells that
         share labels and versions) the call first takes in what the other cells stored; if that has
-        a changed label or a rollback, or the store does not answer, a retrain that is not in force
-        yet is lost. A second call does nothing, nor does one in a forked process. Records that only
-        the database does not take stay in the journal, a file on the local disk, and the next
-        engine writes them. Records that the disk does not take are given up, and an error is
-        logged; no call has said that they are on disk. If the disk hangs, the store stays open, and
-        no other engine can own the cell until the process ends. An engine that replays recordings
-        (`replaying=True`) waits for the disk and the database without a time limit. A store in
-        memory stays open. Raises StoreError while another thread uses the engine.
+        a changed label or a rollback (to an earlier version), or the store does not answer, a
+        retrain that is not in force yet is lost. A second call does nothing, nor does one in a
+        forked process. Records that only the database does not take stay in the journal, a file on
+        the local disk, and the next engine writes them. Records that the disk does not take are
+        given up, and an error is logged; no call has said that they are on disk. If the disk hangs,
+        the store stays open, and no other engine can own the cell until the process ends. An engine
+        that replays recordings (`replaying=True`) waits for the disk and the database without a
+        time limit. A store in memory stays open. Raises StoreError while another thread uses the
+        engine.
         """
         with self._exclusive:
             if self._outbox.is_usable:

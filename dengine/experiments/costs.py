@@ -780,12 +780,13 @@ def _choose(groups: Groups, costs: Costs) -> tuple[list[PolicyCost], PolicyCost,
 
     `groups` has each policy (settings of the rule that decides) with its replays. The rows are
     sorted by mean cost; among equal costs the row with fewer bad accepted parts comes first, then
-    the row whose policy has the higher lower bound. The best row is the first, unless some rows
-    accept fewer bad parts, are not dearer than the first at a one-sided level of 5 %, and have an
-    expected cost (with half an error added to each share of errors) below the price of a check:
-    then it is the row of these with the fewest. The verdict is "does not pay" if the mean or the
-    expected cost of the best row is not below that price. Otherwise it is "pays" if the whole
-    interval of its cost is below that price, else "may pay".
+    the row whose policy has the higher lower bound (the success probability that accepted parts
+    must have). The best row is the first, unless some rows accept fewer bad parts, are not dearer
+    than the first at a one-sided level of 5 %, and have an expected cost (with half an error added
+    to each share of errors) below the price of a check: then it is the row of these with the
+    fewest. The verdict is "does not pay" if the mean or the expected cost of the best row is not
+    below that price. Otherwise it is "pays" if the whole interval of its cost is below that price,
+    else "may pay".
     """
     rows = [_policy_cost(policy, replays, costs) for policy, replays in groups.items()]
     rows.sort(key=lambda row: (row.cost, row.escaped, -row.policy.lower_bound))

@@ -86,7 +86,8 @@ def pool(frame: pd.DataFrame, replays: Sequence[Replay]) -> list[Row]:
     Returns
     -------
     rows : list of dict
-        Beside `CONDITION`, `replays` (how many) and `cycles` (of all of them):
+        Beside `CONDITION`, `replays` (how many) and `cycles` (of all of them; a cycle is a decision
+        on a part):
 
         - certain (accepted or rejected by the model), accepted, rejected, false_positive,
           false_negative, novel (verified as unlike all learned traces) and safe_mode (after which
@@ -97,8 +98,8 @@ def pool(frame: pd.DataFrame, replays: Sequence[Replay]) -> list[Row]:
           mean over the replays would weigh a replay that accepted three parts as much as one that
           accepted 300.
         - Times of retrains and decisions, the first cycle without a check (`first_certain`), and
-          the seconds of checks saved (`saved_s`, `net_s`): median, largest or mean, as `AGGREGATED`
-          says. Replays without such a value (NaN) are left out.
+          the seconds of checks saved (`saved_s`; `net_s`: less what wrong decisions cost): median,
+          largest or mean, as `AGGREGATED` says. Replays without such a value (NaN) are left out.
         - error_lower, error_upper : 95 % interval of the share of bad parts among the accepted
           parts; 0 and 1 if none was accepted.
         - promise_kept : whether the pooled precision is at least `lower_bound`; None if fewer than

@@ -243,11 +243,12 @@ def _as_key(value: object) -> object:
 def compiled(eager: Decider, warm_up_shape: tuple[int, ...]) -> Any:
     """Return a compiled decider that shares the tensors of an eager one.
 
-    A decider is the module that decides on one trace; `eager` is one in Python. The result is a
-    copy of the template, a compiled decider that the process keeps for all deciders with the same
-    classes, attributes and shapes of tensors (`structure_of`). If the process has no such template,
-    `template_of` compiles it, and calls it on a trace of `warm_up_shape` (C, T). Raises what
-    `template_of` raises, if TorchScript cannot compile or run the decider.
+    A decider is the module that decides on one trace, the sensor's samples of a part; `eager` is
+    one in Python. The result is a copy of the template, a compiled decider that the process keeps
+    for all deciders with the same classes, attributes and shapes of tensors (`structure_of`). If
+    the process has no such template, `template_of` compiles it, and calls it on a trace of
+    `warm_up_shape` (C, T). Raises what `template_of` raises, if TorchScript cannot compile or run
+    the decider.
     """
     module = copy.deepcopy(template_of(eager, warm_up_shape))
     submodules = dict(module.named_modules(remove_duplicate=False))

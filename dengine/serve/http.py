@@ -449,8 +449,9 @@ class HttpApi:
 
         The stream ends when the server ends. The first event is `hello`, with the server's version,
         and the second always `changed`. Then comes `changed` whenever decisions, reports of
-        outcomes, changes by hand (also refused ones) or retrains have come since the last event,
-        and `tick` after each 5 seconds without any. Nothing says what has changed.
+        outcomes, changes by hand, like a corrected label (also refused ones), or retrains have come
+        since the last event, and `tick` after each 5 seconds without any. Nothing says what has
+        changed.
         """
 
         async def event_stream() -> AsyncIterator[str]:

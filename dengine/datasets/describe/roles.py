@@ -103,6 +103,7 @@ def propose_roles(p: Proposal) -> None:
 def set_rows(p: Proposal, rows: RowMeanings) -> None:
     """Set `[rows]` in `p`, and leave the rows that are no samples out of its tables and columns.
 
+    `p`, the proposal, holds the description so far and the recordings that it is inferred from.
     `rows` has, by column, the words that keep a row (`keep`; `?` while that is open), drop it, or
     mark its samples as lost. A recording keeps all rows if it lacks a column of `rows`, or has a
     word without a meaning there; all of them do while a `keep` is `?`. But a recording with one
