@@ -353,8 +353,8 @@ class LiveModel:
         the model must be trained again: always for a baseline (a model that the user handed in),
         and if the model cannot change a reference; the other references are changed all the same.
         The caller must retrain then, because each correction is applied only once. An error of the
-        model as it takes a reference again is logged, and the result does not tell of it. A damaged
-        trace is noted as an event in the store's log. Raises StoreError if the store is
+        model as it takes a reference again is logged, and the result does not tell of it; if the
+        trace is damaged, an event in the store's log says so. Raises StoreError if the store is
         unavailable; the corrections before the one that failed stay applied.
         """
         store = self.outbox.store

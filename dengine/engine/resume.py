@@ -204,8 +204,8 @@ def apply_correction(model: EngineModel, store: SqlStore, correction: Correction
     A reference is an embedded labelled trace, which the model counts near a new trace. It is
     removed if the label was withdrawn, and added again if a withdrawn label is to count again. If
     the model cannot take a reference that is added again, the error is logged, and the next version
-    learns the label from the store. If the trace is damaged, this is noted as an event in the
-    store's log.
+    learns the label from the store. If its trace is damaged, it is not added, which is noted as an
+    event in the store's log.
 
     Returns
     -------
@@ -213,31 +213,24 @@ def apply_correction(model: EngineModel, store: SqlStore, correction: Correction
         False if the model keeps references and cannot change this one: nothing is changed, and the
         model must be trained again. True in all other cases, even if nothing is changed: the model
         is a baseline (handed in by the user), which keeps no references; the model has no reference
-        of this label any more; the trace has a fault and was never a reference; the decision is
-        another cell's and its trace is damaged (the reference stays as it was); or the trace is
+        of this label any more; the trace has a fault and was never a reference; or the trace is
         damaged and would have to be added again.
 
     Raises
     ------
     StoreError
-        If the store cannot be read, or the label is neither 0 nor 1.
+        For a reference that is added again, if the store cannot be read, or the label as it was
+        reported is neither 0 nor 1.
     """
     if not model.keeps_references:
         return True
-    # The row as it was reported, of whichever cell; no row where the part was quarantined or the
-    # trace is damaged.
-    data = store.labels.with_traces(first=correction.seq, last=correction.seq, corrected_to=0)
-    if len(data.seq):
-        hash_ = int(data.hashes[0])
-    else:
-        decision = store.decisions.get(correction.decision_id, trace=False)
-        if decision is None or decision.quarantined:
-            return True
-        hash_ = decision.content_hash
     label = None if correction.success is None else int(correction.success)
     if correction.was is not None or label is None:
-        return model.change_reference(correction.seq, hash_, label)
-    model.change_reference(correction.seq, hash_, None)  # a version of a peer may have it already
-    if len(data.seq):
-        guarded(NO_REFERENCE, model.add_reference, data.traces[0], label, hash_, correction.seq)
+        return model.change_reference(correction.seq, correction.content_hash, label)
+    # A version of a peer may have it already.
+    model.change_reference(correction.seq, correction.content_hash, None)
+    # As it was reported, of whichever cell; no row if the trace has a fault or is damaged.
+    data = store.labels.with_traces(first=correction.seq, last=correction.seq, corrected_to=0)
+    for seq, trace, _, hash_ in data.rows():
+        guarded(NO_REFERENCE, model.add_reference, trace, label, hash_, seq)
     return True

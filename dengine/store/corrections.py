@@ -136,7 +136,7 @@ class CorrectionTable(CellTable):
             For a stored value that cannot be read, and if the database fails.
         """
         query = (
-            sa.select(*CORRECTION.c, LABEL.c.seq)
+            sa.select(*CORRECTION.c, *LABEL.c["seq", "content_hash"])
             .select_from(CORRECTION.join(LABEL, CORRECTION_OF_LABEL))
             .where(self._scope.shared(CORRECTION.c.cell_id), CORRECTION.c.number > int(after))
         )

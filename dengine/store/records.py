@@ -449,6 +449,8 @@ class Correction:
         Number of the newest label of the cell, or product, at that moment.
     seq : int
         Number of the label that is corrected.
+    content_hash : int
+        Of its decision, see `StoredDecision`.
     """
 
     number: int
@@ -460,6 +462,7 @@ class Correction:
     event: int
     newest_seq: int
     seq: int
+    content_hash: int = field(metadata={"apart": True})  # JavaScript has no integers of 64 bits
 
 
 @dataclass(frozen=True, slots=True)

@@ -118,7 +118,8 @@ VERSION = _table(  # every retrain, dropped candidates included
 EVENT = _table("event", *_columns(Event, key="number"))
 CORRECTION = _table(  # the newest of a decision counts
     "correction",
-    *_columns(Correction, *(name for name in columns(Correction) if name != "seq"), key="number"),
+    # Number and hash are the label's.
+    *_columns(Correction, *columns(Correction).keys() - {"seq", "content_hash"}, key="number"),
     sa.Index("correction_of", "cell_id", "decision_id", "number"),
 )
 # Tables whose rows the ledger chains.
