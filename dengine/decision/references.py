@@ -360,14 +360,10 @@ class RadiusIndex(nn.Module):
         z = torch.tensor(np.asarray(points, dtype=np.float32))
         blocks = (self.labels[1], self.spaces, self.parts, torch.from_numpy(self.numbers))
         columns = [
-            torch.tensor(np.zeros(len(z)) if values is None else np.asarray(values))
+            torch.tensor(np.zeros(z.shape[:1]) if values is None else np.asarray(values))
             for values in (labels, spaces, parts, numbers)
         ]
-        if (
-            z.ndim != 2
-            or z.size(1) != self.dim
-            or any(column.shape != z.shape[:1] for column in columns)
-        ):
+        if z.shape[1:] != (self.dim,) or any(column.shape != z.shape[:1] for column in columns):
             shapes = ", ".join(str(tuple(values.shape)) for values in (z, *columns))
             raise ValueError(
                 f"Expected points (n, {self.dim}) with n labels, n spaces, n parts and n numbers, "

@@ -77,6 +77,11 @@ def test_a_query_beyond_all_measure_has_no_neighbours_however_large_the_ball(rad
         assert count(filled(Z, y), np.full((1, 2), query), radius) == (0, 0)
 
 
+def test_a_point_without_axes_is_a_value_error():
+    with pytest.raises(ValueError, match=r"Expected points \(n, 1\).* got \(\), \(\)"):
+        RadiusIndex(1).add(0.5, 1)
+
+
 def agreement_of(n_parts: int, agree: float, n_spaces: int = 3, seed: int = 0) -> float:
     """The bound for points in no order, four of a part, with labels that are 80 % good; each is its
     part's common draw with probability `agree`, else its own.
