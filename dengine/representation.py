@@ -37,7 +37,7 @@ def to_jsonable(value: Any) -> Any:
         return result
     if isinstance(value, Mapping):
         return {str(key): to_jsonable(item) for key, item in value.items()}
-    if hasattr(value, "tolist"):  # NumPy
+    if hasattr(type(value), "tolist"):  # NumPy; not one of its classes
         return to_jsonable(value.tolist())
     return without_password(str(value))
 

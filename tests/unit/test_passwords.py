@@ -4,6 +4,7 @@ import json
 import pickle
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from dengine import errors as all_errors
@@ -103,7 +104,7 @@ def test_no_verb_shows_the_password_of_what_it_cannot_use(tmp_path, monkeypatch)
 
 
 def test_json_and_progress_mask_it(capsys):
-    nested = {"store": NOBODY, "all": [NOBODY, (NOBODY,)], "path": Path(NOBODY)}
+    nested = {"store": NOBODY, "all": [NOBODY, (NOBODY, np.float64)], "path": Path(NOBODY)}
     assert SECRET not in json.dumps(to_jsonable(nested))
     with progress_bar(f"importing {NOBODY}", 3) as advance:
         advance(3)
