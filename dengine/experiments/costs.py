@@ -558,7 +558,6 @@ def find_policy(
     """
     _check_search(data, costs, repeats)
     n_cycles = len(data) if cycles is None else cycles
-    contender = contender.with_policy(shadow=False)
     policies, out_of_reach = _within_reach(
         contender,
         candidates(contender, costs, alphas, lower_bounds),
@@ -653,16 +652,16 @@ def _within_reach(
     """Return the policies to be tried, without repeats, and notes on why others are not tried.
 
     The contender plays the replays: it is dengine with a recipe, or a baseline. Each policy is that
-    of the contender with some settings, an item of `changes`, which must hold the `guarantee` (the
-    rule that decides). It is not tried if `Policy` refuses its settings, or if it needs more good
-    parts before it can accept one (`needed_parts`) than `n_good`, the number of good parts that a
-    shuffle plays.
+    of the contender without shadow mode, in which every part is verified, and with some settings,
+    an item of `changes`, which must hold the `guarantee` (the rule that decides). It is not tried
+    if `Policy` refuses its settings, or if it needs more good parts before it can accept one
+    (`needed_parts`) than `n_good`, the number of good parts that a shuffle plays.
     """
     policies = []
     out_of_reach = []
     for settings in changes:
         try:
-            policy = contender.with_policy(**settings).recipe.policy
+            policy = contender.with_policy(**settings, shadow=False).recipe.policy
         except SettingError as error:
             out_of_reach.append(f"guarantee {settings['guarantee']}: {error}".rstrip("."))
             continue
