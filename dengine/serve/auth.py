@@ -124,14 +124,15 @@ def check_key_pair(cert: FilePath | None, key: FilePath | None) -> None:
             "Expected a certificate and its key together (--cert and --key, or --opcua-cert and "
             "--opcua-key), got one of them."
         )
-    # OSError includes ssl.SSLError. Without a password OpenSSL would ask the terminal for one.
+    # OSError includes ssl.SSLError. Without a password OpenSSL would ask the terminal for one; no
+    # key has this one.
     with instead(
         SettingError,
         f"Cannot use {cert} and {key} for TLS",
         OSError,
         do="use PEM files, and a key without a password",
     ):
-        ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER).load_cert_chain(cert, key, password="none")
+        ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER).load_cert_chain(cert, key, password=os.urandom(16))
 
 
 def is_loopback(host: str) -> bool:

@@ -159,7 +159,7 @@ def certificate(folder: Path, *names: str) -> None:
     for words in (
         "req -x509 -newkey rsa:2048 -nodes -days 2 -keyout key.pem -out cert.pem "
         f"-subj /CN=localhost -addext subjectAltName={names}",
-        "rsa -aes256 -in key.pem -out locked.pem -passout pass:secret",
+        "rsa -aes256 -in key.pem -out locked.pem -passout pass:none",
     ):
         command = ["openssl", *words.split()]
         subprocess.run(command, cwd=folder, check=True, capture_output=True)
