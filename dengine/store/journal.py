@@ -64,6 +64,7 @@ DAMAGES = (
     LookupError,
     TypeError,
     AttributeError,
+    OverflowError,
 )  # of reading a damaged header or head
 
 Record = StoredDecision | NewLabel | Event
@@ -634,10 +635,11 @@ def _unpack_fields(content: bytes) -> Fields:
     """Return the fields of a journal's header or head; raise one of DAMAGES if it is damaged.
 
     The head is a small file beside the journal. The fields are a dict by name. DAMAGES are
-    ValueError, LookupError, TypeError and AttributeError. The field "newest", which names the
-    newest entry of the ledger (the store's hash chain, with an entry for each transaction), becomes
-    a pair (number, digest) or None; a list in place of the fields is taken for this field alone.
-    The CRC-32 is compared only if there is one: headers of earlier releases have none.
+    ValueError, LookupError, TypeError, AttributeError and, for a number like 1e999, OverflowError.
+    The field "newest", which names the newest entry of the ledger (the store's hash chain, with an
+    entry for each transaction), becomes a pair (number, digest) or None; a list in place of the
+    fields is taken for this field alone. The CRC-32 is compared only if there is one: headers of
+    earlier releases have none.
     """
     fields = json.loads(content.rstrip(b"\0 "))
     if isinstance(fields, list):
