@@ -212,6 +212,21 @@ def url_of(kind: str, directory: Path) -> str | None:
     return str(directory / "engine.db") if kind == "sqlite" else str(POSTGRES)
 
 
+@pytest.fixture
+def database(tmp_path, monkeypatch):
+    """A new database on the PostgreSQL server, whose other users are left alone."""
+    import sqlalchemy as sa
+
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    url, name = sa.make_url(POSTGRES), f"test_{uuid.uuid4().hex}"
+    admin = sa.create_engine(url, isolation_level="AUTOCOMMIT")
+    with admin.connect() as connection:
+        connection.execute(sa.text(f"CREATE DATABASE {name}"))
+        yield url.set(database=name).render_as_string(hide_password=False)
+        connection.execute(sa.text(f"DROP DATABASE {name} WITH (FORCE)"))
+    admin.dispose()
+
+
 @pytest.fixture(params=["memory", *DATABASES])
 def store(request, tmp_path):
     """A new store of each kind."""

@@ -251,7 +251,8 @@ def _selected_cells(connection: sa.Connection, cell_id: str | None) -> list[str]
     """
     names: set[str] = set()
     for table in METADATA.tables.values():
-        with suppress(sa.exc.DatabaseError):  # a damaged table is left out
+        # A damaged table is left out, and PostgreSQL reads on from the savepoint.
+        with suppress(sa.exc.DatabaseError), connection.begin_nested():
             names |= {
                 str(cell)
                 for cell in connection.execute(sa.select(table.c.cell_id).distinct()).scalars()
@@ -325,7 +326,8 @@ class CellCheck:
         faults: list[HistoryFault] = []
         for table, check in checks:
             try:
-                faults.extend(check)  # faults before an error stay
+                with self.connection.begin_nested():  # after an error PostgreSQL reads on from here
+                    faults.extend(check)  # faults before an error stay
             except sa.exc.DatabaseError as error:
                 self._is_unreadable = True
                 faults.append(self._fault(table, "", f"cannot be read to its end: {error.orig}"))

@@ -7,7 +7,6 @@ import os
 import shutil
 import subprocess
 import sys
-import uuid
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -15,7 +14,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import sqlalchemy as sa
 
 from dengine import Action, DataEngine, Decision, Reason, Source
 from dengine.errors import StoreError
@@ -28,18 +26,6 @@ from tests.slow.faults.kinds import ON_DISKS, Hung, killed_server, lock
 URL = os.environ.get("DENGINE_TEST_POSTGRES", "")
 ASIDE = (*ON_DISKS, killed_server)  # which want a library before the disk, or a server of their own
 FAULTS = {(where, words): fault for where, words, fault, _ in faults(1, 3, 2) if fault not in ASIDE}
-
-
-@pytest.fixture
-def database(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
-    """A new database on the server, whose other users are left alone."""
-    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
-    admin, name = sa.create_engine(URL, isolation_level="AUTOCOMMIT"), f"fault_{uuid.uuid4().hex}"
-    with contextlib.closing(admin.connect()) as connection:
-        connection.execute(sa.text(f"CREATE DATABASE {name}"))
-        yield sa.make_url(URL).set(database=name).render_as_string(hide_password=False)
-        connection.execute(sa.text(f"DROP DATABASE {name} WITH (FORCE)"))
-    admin.dispose()
 
 
 @pytest.mark.parametrize(("where", "words"), FAULTS)
