@@ -379,12 +379,15 @@ class Journal:
         still open and is then closed. If another file is at the path by now, it is used: its header
         and the bytes at these offsets are written over, and those behind them are cut off. Raise
         StoreError if it cannot be written, or another engine has locked it, or the lost file cannot
-        be read; the journal then still uses the lost one.
+        be read or was cut off before the store had its records; the journal then still uses the
+        lost one.
         """
         lost = self._file
         self._file = _open_file(self.path)
         try:
             with _os_errors(self.path):
+                if lost.size < self.end and not self.is_drained:
+                    raise OSError("the lost file was cut off, too")
                 self._file.write(
                     lost.read(self.end - self.drained_to, self.drained_to), self.drained_to
                 )

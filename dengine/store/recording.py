@@ -237,8 +237,9 @@ class Recorder:
         recorded as an event (a row of the store's log): records that the database lacks are copied
         into it from the lost file, which is still open, and a file that is at its path by now is
         written over. Raise StoreError if the disk fails, if that file cannot be created or is
-        locked by another engine, or if the lost file cannot be read (the journal then still uses
-        the lost file); the entries then stay in `unwritten`.
+        locked by another engine, or if the lost file cannot be read or was cut off before the
+        database had its records (the journal then still uses the lost file); the entries then stay
+        in `unwritten`.
         """
         if self._journal.end > LONG:  # a cell that never pauses would fill the disk
             with self.changed:

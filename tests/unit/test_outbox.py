@@ -111,7 +111,7 @@ def test_a_journal_that_cannot_be_written_is_tried_again_and_says_why(box, monke
     assert box.fault == ""
 
 
-def test_a_journal_that_is_made_again_over_a_longer_file_keeps_no_record_of_it(tmp_path):
+def test_a_journal_that_is_made_again_has_all_its_records_and_no_other(tmp_path):
     path, other = tmp_path / "cell.journal", tmp_path / "other.journal"
     with closing(Journal(path)) as journal, closing(Journal(other)) as longer:
         journal.append([b"a record"], 0.0)
@@ -122,6 +122,11 @@ def test_a_journal_that_is_made_again_over_a_longer_file_keeps_no_record_of_it(t
         with closing(Journal(path, owning=False)) as found:  # as after a crash
             records = [record for _, _, record in found.undrained_records()]
             assert (found.loss, records) == ("", [b"a record"])
+        path.rename(other).write_bytes(b"")
+        with pytest.raises(StoreError, match="was cut off"):
+            journal.recreate()
+        journal.drained_to = journal.end  # the store has it
+        journal.recreate()
 
 
 def test_a_host_whose_name_is_not_ascii_has_a_journal_with_a_whole_header(tmp_path, monkeypatch):
