@@ -660,8 +660,10 @@ class Learner:
         self._outbox.check_integrity(0)  # the rule is rebuilt from all of it
         corrections = self._store.corrections.after(self.live.corrected_to)
         self._refill_window(max([self.live.corrected_to, *(row.number for row in corrections)]))
-        is_done = self.live.apply_corrections(corrections)
         self.live.rebuild_rule()
+        # After the rule, whose outcomes the store may not give: a later call does not apply these
+        # corrections again, so it would not know that the model must be retrained.
+        is_done = self.live.apply_corrections(corrections)
         self._precompute_other_start()
         if is_done or not may_retrain:
             return

@@ -6,13 +6,14 @@ import sqlite3
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
 
 from dengine import Action, DataEngine, Dataset, Reason, Recipe
-from dengine.errors import SettingError
+from dengine.errors import SettingError, StoreError
 from tests.support.driving import RECIPE, Counting, evidence, make, rule_state
 from tests.support.driving import drive as play
 
@@ -163,6 +164,17 @@ def test_a_baseline_is_trained_anew_at_once_and_goes_back_to_traces_as_they_are_
         engine.set_policy(replace(engine.policy, alpha=0.2))
     engine.set_policy(replace(engine.policy, audit_rate=0.5, stops="all"))  # the engine's own
     assert engine.policy.audit_rate == 0.5
+
+
+def test_a_retrain_that_a_correction_needs_waits_for_the_store(data):
+    engine = make()
+    first, second, *_ = play(engine, data, 0, 60)
+    engine.store.labels.outcomes_since = Mock(side_effect=[StoreError("gone"), []])
+    engine.model.change_reference = Mock(side_effect=[False, True])
+    with pytest.raises(StoreError):
+        engine.forget(first.decision.id)
+    engine.forget(second.decision.id)
+    assert engine.version == 2
 
 
 def test_the_audit_rate_alone_leaves_the_local_rule_as_it_is(data):
