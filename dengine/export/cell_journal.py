@@ -217,16 +217,15 @@ def _parse_part(words: list[str], spec: TraceSpec) -> JournalLine:
     probability of a check) are not in the line; they become None, 0 and 1. Raises ValueError,
     LookupError or TraceError for words that are no such line.
     """
-    id_, label, part, action, predicted, reason, *numbers = words
-    lower, upper, n_success, n_failure, *samples = numbers
+    id_, label, part, action, predicted, reason, lower, upper, successes, failures, *samples = words
     decision = Decision(
         id=id_,
         action=Action(action),
         predicted=Action(predicted),
         lower=float(lower),
         upper=float(upper),
-        n_success=int(n_success),
-        n_failure=int(n_failure),
+        n_success=int(successes),
+        n_failure=int(failures),
         embedding=None,
         model_version=0,
         reason=Reason(reason),
@@ -320,15 +319,16 @@ def _with_known_outcomes(journal: CellJournal, stops: str) -> list[JournalLine]:
     are. If it is "all", an accepted part without a label gets the label good, because the next part
     was decided; the last part, if its outcome is not known yet (`journal.pending`), is left out. An
     accepted part whose label came late has two lines, and only one is returned: the late line if it
-    says bad, else the first line, with the label good.
+    says bad, else the first line, with the label good. If an accepted part has several labels, the
+    lines that say bad are returned, else the first line.
     """
     if stops == "some":
         return journal.lines
-    late = {line.decision.id: line.label for line in journal.lines if line.late}
+    stopped = {line.decision.id for line in journal.lines if line.late and not line.label}
     lines = []
     for line in journal.lines:
         is_accept = line.decision.action is Action.ACCEPT
-        is_repeated = is_accept and late.get(line.decision.id) == line.late
-        if line is not journal.pending and not is_repeated:
+        is_superseded = line.label is not False if line.decision.id in stopped else line.late
+        if line is not journal.pending and not (is_accept and is_superseded):
             lines.append(replace(line, label=True) if line.label is None else line)
     return lines
