@@ -83,8 +83,8 @@ def check_agreement(data: Dataset, trace_spec: TraceSpec) -> None:
     not compared. Raises SettingError if no `TraceSpec` can be made of the data set (`data.spec`).
     """
     spec = data.spec
-    is_resampled = {item.fit == "resample" for item in (spec, trace_spec)}
-    is_same = len(is_resampled) == 1 and spec.samples == trace_spec.samples
+    is_same = (spec.fit == "resample") is (trace_spec.fit == "resample")
+    is_same = is_same and spec.samples == trace_spec.samples
     expect(
         data.lengths is None or is_same,
         f"recordings brought to {trace_spec.samples} samples by {trace_spec.fit}",
@@ -111,7 +111,7 @@ class ImportReport:
     quarantined : int
         Labels of traces with a fault, which are stored but never train.
     repeated : int
-        Labels that the store had already.
+        Labels that the store had already, also of parts whose label was withdrawn.
     resumed : bool
         Whether the store existed before.
     cut : int
@@ -222,7 +222,7 @@ def import_parts(
 
     Each chunk is one transaction; if storing one raises StoreError, those before stay. If the store
     has a label for a decision, also one that was withdrawn, nothing is changed: the new label is
-    counted as repeated or, if it differs or the stored one was withdrawn, as contradicted. A
+    counted as contradicted if it differs from one that counts, and otherwise as repeated. A
     decision that it has without a label stays as it is, too, and gets only the label. New rows have
     the time of the import. A trace with a fault (like a NaN, or a value at the limit of the sensor)
     is stored but never used in training, and its decision gets the fault as its reason. If
@@ -276,7 +276,7 @@ def import_parts(
             earlier = new.get(id_) or store.decisions.get(id_)
             reported = labels.get(id_) or earlier
             if reported is not None and reported.source is not None:  # a forgotten one has a label
-                outcome = "repeated" if label == reported.success else "contradicted"
+                outcome = "repeated" if reported.success in (label, None) else "contradicted"
                 counts[outcome] += label is not None
                 continue
             stored = earlier

@@ -83,7 +83,7 @@ def test_a_part_is_found_and_reported_by_its_number(store, make_data):
         assert "'P-9', which is unknown" in refused(verb, store, *words)
 
 
-def test_several_are_forgotten_at_once_or_none_by_whoever_is_logged_in(store):
+def test_several_are_forgotten_at_once_or_none_by_whoever_is_logged_in(store, make_data):
     before = labels(store)
     one, two = before.pop(1)[0], before.pop(2)[0]
     assert "'nobody'" in refused("forget", store, one, "nobody")
@@ -95,6 +95,7 @@ def test_several_are_forgotten_at_once_or_none_by_whoever_is_logged_in(store):
         (event,) = engine.store.events.newest()
     assert (event.kind, event.author) == ("forget", getpass.getuser())
     assert event.data["reason"] == "wrong part"
+    assert import_labelled(store, replace(make_data(60), rate_hz=500.0)).repeated == 60
 
 
 def test_an_earlier_version_answers_again(store):
