@@ -17,6 +17,7 @@ from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from inspect import signature
 from pathlib import Path
+from types import NoneType
 from typing import Any
 
 import numpy as np
@@ -31,7 +32,7 @@ Params = Mapping[str, bool | int | float | str]
 Table = Mapping[str, Any]  # of a TOML file
 CLASS_PATH = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")  # module:Class
 BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")  # a key that TOML takes without quotes
-PLAIN = (bool, int, float, str, np.bool_, np.integer, np.floating)
+PLAIN = (bool, int, float, str, np.bool_, np.integer, np.floating, NoneType)
 NOVELTY = 1.5
 LARGEST = 2**20  # bytes of a recipe's file
 # Least and greatest value of the integer settings. No machine can use more, and an error now is
@@ -175,7 +176,7 @@ class Recipe:
             self.params,
         )
         for name, value in self.params.items():
-            is_plain = value is None or (isinstance(value, PLAIN) and value != "none")
+            is_plain = isinstance(value, PLAIN) and value != "none"
             expect(
                 is_plain and BARE_KEY.fullmatch(str(name)) is not None,
                 "params of plain names and values",
@@ -359,7 +360,7 @@ class Recipe:
         defaults = {"random_state": seed, "folds": self.folds}
         accepted = signature(reducer_class(self.reducer)).parameters
         params = {name: value for name, value in defaults.items() if name in accepted}
-        return make_reducer(self.reducer, **params | dict(self.params))
+        return make_reducer(self.reducer, **{**params, **self.params})
 
 
 def _check_keys(table: Table, record_type: Any, where: str) -> None:
@@ -411,8 +412,9 @@ def _name_and_params(reducer: Any, params: Params) -> tuple[str, Params]:
     values: Table = reducer.get_params(deep=False)
     defaults = {name: parameter.default for name, parameter in signature(cls).parameters.items()}
     is_plain = all(
-        (isinstance(value, PLAIN) and value != "none")
-        or (value is None and defaults.get(name) is None)
+        isinstance(value, PLAIN)
+        and value != "none"
+        and (value is not None or defaults.get(name) is None)
         for name, value in values.items()
     )
     if not is_plain or "<locals>" in cls.__qualname__ or cls.__module__ == "__main__":
@@ -429,9 +431,7 @@ def describe_estimator(estimator: Any) -> str:
     process.
     """
     values = (
-        f"{name}={value!r}"
-        if isinstance(value, PLAIN) or value is None
-        else f"{name}: {type(value).__qualname__}"
+        f"{name}={value!r}" if isinstance(value, PLAIN) else f"{name}: {type(value).__qualname__}"
         for name, value in sorted(estimator.get_params(deep=True).items())
     )
     return f"{type(estimator).__qualname__}({', '.join(values)})"

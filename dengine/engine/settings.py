@@ -5,6 +5,7 @@ not among them.
 """
 
 import json
+import sys
 from collections.abc import Collection, Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from typing import TYPE_CHECKING, Any, Self
@@ -17,6 +18,7 @@ from ..model.base import BaselineAdapter, EngineModel, Model
 from ..model.neighbours import ModelPrediction
 from ..recipe import OBJECT_PREFIX, Recipe, describe_estimator
 from ..records import StoredSettings, TraceSpec, is_whole, stored_trace_spec
+from ..reducers import make_reducer, reducer_class
 from ..store.outbox import Outbox
 from ..traces import ForceLimitsGate
 
@@ -152,7 +154,7 @@ class EngineSettings:
         allow_import : bool or collection of str
             Whether any class of the user that the recipe (the settings of model, policy and
             retrains) names may be imported, or the names of those that may, `module:Class`; a class
-            that `reducer` names is allowed.
+            that `reducer` names, or that it is an object of, is allowed.
 
         Returns
         -------
@@ -181,7 +183,9 @@ class EngineSettings:
             )
         recipe = Recipe.from_store(texts, f"the recipe in {name}")
         recipe = _with_objects(recipe, texts, name, reducer, model)
-        allowed = allow_import is True or {*(allow_import or ()), *named_classes(reducer)}
+        # The name of an object's class may be another in the recipe than the class's own.
+        named = reducer if isinstance(reducer, str | None) else recipe.reducer
+        allowed = allow_import is True or {*(allow_import or ()), *named_classes(named)}
         check_imports(recipe, name, allowed)
         numbers: list[int] = []
         for setting in ("seed", "policy_since", "evidence_since", "began_in"):
@@ -273,8 +277,10 @@ class EngineSettings:
             name for name in compared & requested.keys() if requested[name] != present[name]
         )
         if different:
-            stored = ", ".join(f"{name} {present[name]}" for name in different)
-            got = ", ".join(f"{name} {requested[name]}" for name in different)
+            stored, got = (
+                ", ".join(f"{name} {settings[name]}" for name in different)
+                for settings in (present, requested)
+            )
             raise SettingError(
                 f"Expected the store's own settings ({stored}), got {got}; leave them out, "
                 "or name another store."
@@ -292,43 +298,47 @@ def _with_objects(
     store's settings, and `name` is the name of the store for messages. If the store's engine has a
     `model` of the user, any `reducer` is accepted, and the recipe is returned as it is. So is a
     recipe that names its reducer. With such a recipe `reducer` may be None, a name, which is not
-    compared here, or an object, if the recipe has its class (`module:Class`, by the module that
-    defines it) and exactly those of its parameters that are not None, defaults included. If the
-    recipe has a short name like "conv", no object is accepted.
+    compared here, or an object, if the recipe has its class (`module:Class`, by any loaded module
+    that has the class) and its parameters, those that the recipe leaves out at the defaults of the
+    class. An object is made of the class to compare them. If the recipe has a short name like
+    "conv", no object is accepted.
 
-    Raises SettingError for another object as `reducer`; if an object that must be handed in is
-    missing, or differs from the one that the store was made with (a reducer in its class and
-    parameters, a model in its class alone; a store without a description of its object accepts
-    any); if a `model` is passed to an engine that trains the recipe's own model; and if the model
-    lacks fit, add, count, predict_interval or decide (`BaselineAdapter`).
+    Raises SettingError for another object as `reducer`, or if its class refuses a parameter of the
+    recipe; if an object that must be handed in is missing, or differs from the one that the store
+    was made with (a reducer in its class and parameters, a model in its class alone; a store
+    without a description of its object accepts any); if a `model` is passed to an engine that
+    trains the recipe's own model; and if the model lacks fit, add, count, predict_interval or
+    decide (`BaselineAdapter`). What the constructor of a user's class raises passes unchanged.
     """
     if "model" in texts and model is None:
         raise SettingError(
             f"The engine of {name} drove a {texts['model']}; hand it in again: open(url, "
             "model=...)."
         )
-    if "model" not in texts and model is not None:
-        raise SettingError(
-            f"The engine of {name} has its own model, {recipe.name}; leave model=... out."
-        )
     if model is not None:
+        if "model" not in texts:
+            raise SettingError(
+                f"The engine of {name} has its own model, {recipe.name}; leave model=... out."
+            )
         _check_description(texts, name, BaselineAdapter(model).description)
         return recipe
     if recipe.name.startswith(OBJECT_PREFIX):
-        if reducer is None or isinstance(reducer, str):
+        if isinstance(reducer, str | None):
             raise SettingError(
                 f"The reducer of {name}, {recipe.reducer}, has no name in TOML: "
                 "hand it in again, reducer=..."
             )
         _check_description(texts, name, describe_estimator(reducer))
         return replace(recipe, reducer=reducer, params={})
-    if reducer is not None and not isinstance(reducer, str):
-        again = Recipe.from_toml(Recipe(reducer).to_toml())
-        if (again.reducer, again.params) != (recipe.reducer, recipe.params):
-            got = describe_estimator(reducer)
-            raise SettingError(
-                f"Expected reducer {recipe.name} of {name}, got {got}; leave it out."
-            )
+    if isinstance(reducer, str | None):
+        return recipe
+    if (
+        recipe.name.partition(":")[0] not in sys.modules  # nothing is imported
+        or reducer_class(recipe.name) is not type(reducer)
+        or Recipe(make_reducer(recipe.name, **recipe.params)).to_toml() != Recipe(reducer).to_toml()
+    ):
+        got = describe_estimator(reducer)
+        raise SettingError(f"Expected reducer {recipe.name} of {name}, got {got}; leave it out.")
     return recipe
 
 
@@ -339,8 +349,8 @@ def _check_description(texts: StoredSettings, name: str, description: str) -> No
     compared with the setting "described" of the store, among `texts`, if there is one; if there is
     none, nothing is compared. `name` is the name of the store, for the message.
     """
-    made_with = texts.get("described")
-    if made_with is not None and description != made_with:
+    made_with = texts.get("described", description)
+    if description != made_with:
         raise SettingError(
             f"{name} was made with {made_with}, got {description}: its labels were counted by that "
             "one."

@@ -105,7 +105,7 @@ def make_reducer(name: str, **params: Any) -> Any:
     """
     cls = reducer_class(name)
     allowed = signature(cls).parameters
-    unknown = sorted(set(params) - set(allowed))
+    unknown = sorted(params.keys() - allowed)
     if unknown:
         raise SettingError(
             f"{cls.__name__} has no parameter {', '.join(unknown)}; it has {', '.join(allowed)}."

@@ -229,6 +229,11 @@ def test_what_a_store_names_is_imported_only_where_its_caller_says_so(
     monkeypatch.delitem(sys.modules, "theirs")
 
 
+def test_an_object_is_taken_by_any_name_of_its_class_in_the_store():
+    texts = EngineSettings(Recipe("sklearn.decomposition:PCA")).to_store()
+    EngineSettings.from_store(texts, "cell.db", PCA())
+
+
 def test_an_object_without_a_name_runs_and_is_handed_in_again(data, tmp_path):
     for params in ({"segments": [1]}, {"a b": 1}, {"inner": PCA(2)}):  # that TOML cannot say
         with pytest.raises(SettingError, match="params of plain names and values"):
