@@ -331,14 +331,9 @@ class Feedback:
             self._live.count_overdue(stored.decision)
         self._live.mark_examined_to(overdue_to)
 
-    def clear_remedy(self) -> None:
-        """Forget what must be put right after a wrong label, because it is about to be done."""
-        self.remedy = None
-
-    def retry_remedy(self, remedy: Remedy) -> None:
-        """Put a remedy back that failed because the store is unavailable.
-
-        A remedy that is set meanwhile is replaced.
+    def set_remedy(self, remedy: Remedy | None) -> None:
+        """Set what must be put right after a wrong label: None while it is done, or, if it failed
+        because the store is unavailable, the remedy again, in place of one that was set meanwhile.
         """
         self.remedy = remedy
 

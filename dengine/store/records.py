@@ -613,7 +613,7 @@ def _to_column(value: Any, type_: type) -> Any:
     if issubclass(type_, StrEnum):
         return type_(value).value
     as_json = partial(json.dumps, default=float)
-    writers: dict[type, Callable[[Any], Any]] = {tuple: as_json, dict: as_json, np.ndarray: pack}
+    writers: dict[type, Any] = {tuple: as_json, dict: as_json, np.ndarray: pack}
     return writers.get(type_, type_)(value)
 
 
@@ -629,7 +629,7 @@ def _from_column(value: Any, type_: type) -> Any:
         return value
     if type_ is tuple:
         return tuple(tuple(row) for row in json.loads(value))
-    readers: dict[type, Callable[[Any], Any]] = {dict: json.loads, np.ndarray: unpack}
+    readers: dict[type, Any] = {dict: json.loads, np.ndarray: unpack}
     return readers.get(type_, type_)(value)
 
 

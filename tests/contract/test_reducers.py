@@ -206,14 +206,19 @@ class Linear(nn.Module):
         return self.layers(x)
 
 
+def with_sample(value: float):
+    """A function that gives a trace this value as its eighth sample."""
+    return lambda x: np.where(np.arange(len(x)) == 7, value, x)
+
+
 EXTREME = {  # what a labelled trace may hold; the last two only in a store of before they were a fault
-    "1e17": lambda x: np.where(np.arange(len(x)) == 7, 1e17, x),
-    "the largest that is no fault": lambda x: np.where(np.arange(len(x)) == 7, -1e18, x),
+    "1e17": with_sample(1e17),
+    "the largest that is no fault": with_sample(-1e18),
     "alternating": lambda x: np.resize([1e16, -1e16], len(x)),
     "all of it": lambda x: 3e16 * x,
     "denormal": lambda x: 1e-40 * x,
-    "3e38": lambda x: np.where(np.arange(len(x)) == 7, 3e38, x),
-    "1e19": lambda x: np.where(np.arange(len(x)) == 7, 1e19, x),
+    "3e38": with_sample(3e38),
+    "1e19": with_sample(1e19),
 }
 TEACHABLE = {
     **{name: (lambda name=name: new(name)) for name in REDUCERS},

@@ -4,7 +4,6 @@ not be used.
 
 import hashlib
 import re
-from importlib.util import find_spec
 
 import numpy as np
 import pytest
@@ -19,10 +18,9 @@ from dengine.decision.rule import DecisionRule
 from dengine.errors import ExportError, TraceError
 from dengine.export import export_onnx, load_onnx
 from dengine.records import Action, Reason
-from tests.support.exports import fitted, trained
+from tests.support.exports import NEEDS_ONNX, fitted, trained
 
-NEEDED = ("onnx", "onnxruntime", "onnxscript")
-pytestmark = pytest.mark.skipif(not all(map(find_spec, NEEDED)), reason=f"needs {NEEDED}")
+pytestmark = NEEDS_ONNX
 SPEC = TraceSpec(100, limit=500.0)
 # Another interval is the same file with another number in it.
 BALLS = [{}, pytest.param({"interval": "binomial", "radius": 0.5}, marks=pytest.mark.slow)]

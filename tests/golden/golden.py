@@ -50,8 +50,10 @@ AUDITED = LOOSE | {"audit_rate": 0.15}
 POOLED = AUDITED | {"guarantee": "pooled"}
 ALL = {"stops": "all"}  # every bad part that is accepted stops the system
 Arrays = dict[str, np.ndarray]
+CycleList = list[Cycle]
+Settings = Mapping[str, Any]
 Verb = Callable[
-    [DataEngine, list[Cycle], Path], DataEngine
+    [DataEngine, CycleList, Path], DataEngine
 ]  # what people do to an engine between two parts
 
 
@@ -85,30 +87,30 @@ def turned(seed: int, begin: int = 150) -> Dataset:
     return replace(data, y=data.y ^ other)
 
 
-def restart(engine: DataEngine, cycles: list[Cycle], store: Path) -> DataEngine:
+def restart(engine: DataEngine, cycles: CycleList, store: Path) -> DataEngine:
     engine.close()
     return DataEngine.open(str(store), replaying=True)
 
 
-def correct(engine: DataEngine, cycles: list[Cycle], store: Path) -> DataEngine:
+def correct(engine: DataEngine, cycles: CycleList, store: Path) -> DataEngine:
     """Five labels were wrong."""
     for cycle in [item for item in cycles if item.success][-5:]:
         engine.correct(cycle.decision.id, success=False)
     return engine
 
 
-def forget(engine: DataEngine, cycles: list[Cycle], store: Path) -> DataEngine:
+def forget(engine: DataEngine, cycles: CycleList, store: Path) -> DataEngine:
     """Ten labels are worth nothing."""
     engine.forget(*[cycle.decision.id for cycle in cycles if cycle.success is not None][-10:])
     return engine
 
 
-def roll_back(engine: DataEngine, cycles: list[Cycle], store: Path) -> DataEngine:
+def roll_back(engine: DataEngine, cycles: CycleList, store: Path) -> DataEngine:
     engine.rollback(1)
     return engine
 
 
-def loosen(engine: DataEngine, cycles: list[Cycle], store: Path) -> DataEngine:
+def loosen(engine: DataEngine, cycles: CycleList, store: Path) -> DataEngine:
     engine.set_policy(Policy(alpha=0.2, lower_bound=0.8, stops="all"))
     return engine
 
@@ -116,7 +118,7 @@ def loosen(engine: DataEngine, cycles: list[Cycle], store: Path) -> DataEngine:
 def shadow(on: bool) -> Verb:
     """The one place that knows how the shadow mode is asked for."""
 
-    def ask(engine: DataEngine, cycles: list[Cycle], store: Path) -> DataEngine:
+    def ask(engine: DataEngine, cycles: CycleList, store: Path) -> DataEngine:
         engine.set_shadow(on)
         return engine
 
@@ -128,7 +130,7 @@ class Story:
     """One engine over `CYCLES` parts.  verbs : by the number of parts before."""
 
     seed: int
-    policy: Mapping[str, Any]
+    policy: Settings
     parts: Callable[[int], Dataset] = numbered
     verbs: Mapping[int, Verb] = field(default_factory=dict)
 
@@ -136,9 +138,9 @@ class Story:
         recipe = Recipe.load("rocket").with_policy(**self.policy)
         return DataEngine(recipe=recipe, store=str(store), seed=self.seed, replaying=True)
 
-    def live(self, store: Path) -> tuple[DataEngine, list[Cycle]]:
+    def live(self, store: Path) -> tuple[DataEngine, CycleList]:
         """The engine after its last part, still open, and what happened."""
-        engine, cell, cycles = self.start(store), ReplayCell(self.parts(self.seed)), list[Cycle]()
+        engine, cell, cycles = self.start(store), ReplayCell(self.parts(self.seed)), CycleList()
         for done in sorted({*self.verbs, CYCLES}):
             cycles += engine.run(cell, done - len(cycles))
             if done in self.verbs:
@@ -187,10 +189,10 @@ class Replayed:
 
     name: str
     seed: int
-    policy: Mapping[str, Any]
+    policy: Settings
     cycles: int = CYCLES
-    changes: Mapping[str, Any] = field(default_factory=dict)
-    options: Mapping[str, Any] = field(default_factory=dict)
+    changes: Settings = field(default_factory=dict)
+    options: Settings = field(default_factory=dict)
 
     def play(self, folder: Path) -> Arrays:
         recipe = replace(Recipe.load(self.name), **self.changes).with_policy(**self.policy)

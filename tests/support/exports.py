@@ -2,10 +2,12 @@
 
 import zlib
 from dataclasses import fields
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 
 from dengine import (
     DataEngine,
@@ -19,6 +21,9 @@ from dengine import (
 )
 from tests.support.driving import learn
 
+# Looked for, not imported: that would take every worker seconds.
+NEEDED = ("onnx", "onnxruntime", "onnxscript")
+NEEDS_ONNX = pytest.mark.skipif(not all(map(find_spec, NEEDED)), reason=f"needs {NEEDED}")
 SAMPLES, LIMIT = 100, 500.0
 FORCE_LIMITS = (
     ForceLimits(0.02, 0.06, high=5.0),

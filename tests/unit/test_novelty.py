@@ -42,13 +42,16 @@ def spike(x: Traces, rng: np.random.Generator) -> Traces:
     return spiked
 
 
-def proof(name: str) -> Callable[[Traces, np.random.Generator], Traces]:
+Spoil = Callable[[Traces, np.random.Generator], Traces]
+
+
+def proof(name: str) -> Spoil:
     """A kind of the proof's."""
     return lambda x, rng: KINDS[name](x[:, 0], x[:, 0], rng)[:, None].astype(np.float32)
 
 
 noise, hum = proof("white noise"), proof("hum on good parts")
-GARBAGE: dict[str, Callable[[Traces, np.random.Generator], Traces]] = {
+GARBAGE: dict[str, Spoil] = {
     "noise": noise,
     "sine": proof("sine"),
     "hum": hum,

@@ -15,11 +15,10 @@ from dengine import ModelPrediction, TraceSpec, WilsonRadiusClassifier, load_dat
 from dengine.export import export_onnx, load_onnx, make_key
 from dengine.export.bundle import write_export
 from dengine.records import Action, Reason
+from tests.support.exports import NEEDS_ONNX
 from tests.support.programs import Program, must_agree
 
-# Looked for, not imported: that would take every worker seconds.
-NEEDED = ("onnx", "onnxruntime", "onnxscript")
-pytestmark = pytest.mark.skipif(not all(map(find_spec, NEEDED)), reason=f"needs {NEEDED}")
+pytestmark = NEEDS_ONNX
 
 
 @pytest.fixture(scope="module")

@@ -31,6 +31,7 @@ from numpy.typing import NDArray
 from dengine import Policy
 
 Moment = tuple[float, int]
+Row = dict[str, Any]  # of a table
 CONFIRMED, DECIDED, OVERDUE, TOLD = range(4)  # where in a call
 NEVER: Moment = (float("inf"), TOLD)
 Floats = NDArray[np.float64]
@@ -62,14 +63,14 @@ class Part:
     """
 
     cell: int
-    row: dict[str, Any]
+    row: Row
     trace: Floats
     decided: Moment
     is_confirmed_by_silence: bool
     next_decided: Moment = NEVER
     gone_on: Moment = NEVER
     overdue: Moment = NEVER
-    label: dict[str, Any] | None = None
+    label: Row | None = None
     corrections: list[tuple[Moment, bool | None]] = field(default_factory=list)
 
     @property
@@ -136,7 +137,7 @@ class Ledger:
         with closing(sqlite3.connect(f"file:{path}?mode=ro", uri=True)) as connection:
             connection.row_factory = sqlite3.Row
 
-            def read(table: str, order: str) -> list[dict[str, Any]]:
+            def read(table: str, order: str) -> list[Row]:
                 query = f"SELECT * FROM {table} ORDER BY cell_id, {order}"
                 return [dict(row) for row in connection.execute(query)]
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from .implementation import Bools, Floats, Rules
 
+PartDraw = tuple[Floats, Floats]  # failure probabilities and scores, each of shape (R,)
 N_SNOOPED = 20  # scores that a snooper chooses from
 RETRAIN_EVERY = 50
 EDGE = 1.03  # tolerances: just beyond what is allowed
@@ -34,7 +35,7 @@ class Stream:
         self.n_parts = n_parts
         self.rng = rng
 
-    def next(self, t: int, rules: Rules) -> tuple[Floats, Floats]:
+    def next(self, t: int, rules: Rules) -> PartDraw:
         """Return failure probabilities and scores of part t, each of shape (R,)."""
         raise NotImplementedError
 
@@ -64,7 +65,7 @@ class Stream:
 class Informative(Stream):
     """The score is the true probability of success."""
 
-    def next(self, t: int, rules: Rules) -> tuple[Floats, Floats]:
+    def next(self, t: int, rules: Rules) -> PartDraw:
         p = self.mixed()
         return p, 1.0 - p
 
@@ -72,7 +73,7 @@ class Informative(Stream):
 class Useless(Stream):
     """The score says nothing, and the parts fail slightly more often than is allowed."""
 
-    def next(self, t: int, rules: Rules) -> tuple[Floats, Floats]:
+    def next(self, t: int, rules: Rules) -> PartDraw:
         is_bad_kind = self.rng.random(self.n_replays) < 0.5
         p = np.where(is_bad_kind, 2.0 * EDGE * self.tolerance, 0.0)
         return p, self.uniform(0.3, 1.0)
@@ -81,7 +82,7 @@ class Useless(Stream):
 class Overconfident(Stream):
     """All parts are scored far better than they are, the worse ones lower."""
 
-    def next(self, t: int, rules: Rules) -> tuple[Floats, Floats]:
+    def next(self, t: int, rules: Rules) -> PartDraw:
         p = self.tolerance * self.uniform(0.6, 2.0 * EDGE - 0.6)
         return p, 1.0 - 0.1 * p
 
@@ -89,7 +90,7 @@ class Overconfident(Stream):
 class Drifting(Stream):
     """The score stays, while the probability rises from 0.3 to 3 tolerances."""
 
-    def next(self, t: int, rules: Rules) -> tuple[Floats, Floats]:
+    def next(self, t: int, rules: Rules) -> PartDraw:
         p = self.constant(self.tolerance * (0.3 + 2.7 * t / self.n_parts))
         return p, 1.0 - 0.5 * self.tolerance * self.rng.random(self.n_replays)
 
@@ -97,7 +98,7 @@ class Drifting(Stream):
 class Alternating(Stream):
     """An informative model and a useless, confident one take turns at retrains."""
 
-    def next(self, t: int, rules: Rules) -> tuple[Floats, Floats]:
+    def next(self, t: int, rules: Rules) -> PartDraw:
         p = self.mixed()
         is_useless = t // RETRAIN_EVERY % 2 == 1
         return p, 1.0 - (self.rng.permutation(p) if is_useless else p)
@@ -114,7 +115,7 @@ class Snooped(Stream):
         self.n_best_wrong = np.zeros((n_replays, N_SNOOPED))
         self.is_best = np.zeros((n_replays, N_SNOOPED), dtype=bool)
 
-    def next(self, t: int, rules: Rules) -> tuple[Floats, Floats]:
+    def next(self, t: int, rules: Rules) -> PartDraw:
         scores = self.rng.random((self.n_replays, N_SNOOPED))
         self.is_best = scores > 0.5
         share = (self.n_best_wrong + 1.0) / (self.n_best + 2.0)
@@ -143,7 +144,7 @@ class Adversary(Stream):
         self.n_members = np.zeros(n_replays)
         self.sum = np.zeros(n_replays)
 
-    def next(self, t: int, rules: Rules) -> tuple[Floats, Floats]:
+    def next(self, t: int, rules: Rules) -> PartDraw:
         side = rules.sides[0]
         p = self.tolerance * self.uniform(0.0, 3.0)
         mean = (self.sum + p) / (self.n_members + 1.0)
@@ -160,7 +161,7 @@ class Adversary(Stream):
 class Tied(Stream):
     """Three scores, two of them exactly on a level."""
 
-    def next(self, t: int, rules: Rules) -> tuple[Floats, Floats]:
+    def next(self, t: int, rules: Rules) -> PartDraw:
         kind = self.rng.integers(0, 3, self.n_replays)
         levels = rules.sides[0].levels
         p = self.tolerance * np.choose(kind, [0.4, 2.0 * EDGE - 0.4, 5.0])
@@ -172,7 +173,7 @@ class Constant(Stream):
 
     share = EDGE
 
-    def next(self, t: int, rules: Rules) -> tuple[Floats, Floats]:
+    def next(self, t: int, rules: Rules) -> PartDraw:
         return self.constant(self.share * self.tolerance), self.constant(
             1.0 - 0.25 * self.tolerance
         )
@@ -203,7 +204,7 @@ class Peeking(Constant):
 class Doubling(Stream):
     """One score for all parts. They fail with 0.4 tolerances, and after 200 of them with two."""
 
-    def next(self, t: int, rules: Rules) -> tuple[Floats, Floats]:
+    def next(self, t: int, rules: Rules) -> PartDraw:
         p = self.constant((0.4 if t < 200 else 2.0) * self.tolerance)
         return p, self.constant(1.0 - 0.25 * self.tolerance)
 
@@ -211,7 +212,7 @@ class Doubling(Stream):
 class Sly(Stream):
     """All parts are good while they are checked; while they pass, 3 tolerances of them are bad."""
 
-    def next(self, t: int, rules: Rules) -> tuple[Floats, Floats]:
+    def next(self, t: int, rules: Rules) -> PartDraw:
         score = self.constant(1.0 - 0.25 * self.tolerance)
         passes = rules.sides[0].threshold <= score
         return np.where(passes, 3.0 * self.tolerance, 0.0), score
