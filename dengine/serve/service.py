@@ -21,7 +21,6 @@ from collections.abc import AsyncIterator, Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, field
-from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 from numpy.typing import ArrayLike
@@ -253,12 +252,14 @@ class CellService:
         if pending.done() or not future.cancel():
             decision = await pending
         else:
-            record = partial(self.engine.decide, trace, part, decision_id=id_, timed_out=True)
-            loop = asyncio.get_running_loop()
-            decision = await loop.run_in_executor(self._timeout_threads, record)
+            recording = self._timeout_threads.submit(
+                self.engine.decide, trace, part, decision_id=id_, timed_out=True
+            )
+            decision = await asyncio.wrap_future(recording)
             self.late += 1
-        is_late = decision.reason is Reason.LATE
-        response = ServiceResponse(decision, is_late, time.monotonic() - begin)
+        response = ServiceResponse(
+            decision, decision.reason is Reason.LATE, time.monotonic() - begin
+        )
         return self._notify_observers(response)
 
     async def report(self, decision_id: str, success: float, author: str = "") -> ReportResponse:
@@ -338,8 +339,7 @@ class CellService:
             return False, retrain
 
         repeated, retrain = await self.call(work)
-        seconds = time.monotonic() - begin
-        response = ReportResponse(decision_id, label, repeated, retrain, seconds)
+        response = ReportResponse(decision_id, label, repeated, retrain, time.monotonic() - begin)
         return self._notify_observers(response)
 
     async def find(self, decision_id: str) -> StoredDecision | None:
@@ -367,11 +367,11 @@ class CellService:
         `work` is called with the engine and with whether the future was cancelled. A cancelled
         future does not stop the work, but the result is dropped. After the work every iteration
         over `changes`, by which clients wait for changes, goes on, unless the work is `read_only`.
-        Raises BusyError if the service is closing, if the engine's thread has ended, or if the
-        queue is full; only a full queue is counted, in `busy`.
+        Raises BusyError if the service is closing or the queue is full; only a full queue is
+        counted, in `busy`. If the engine's thread has ended, the future raises BusyError.
         """
         job = Job(Future(), work, read_only)
-        if self._closing or not self._thread.is_alive():
+        if self._closing:
             raise BusyError(CLOSING)
         try:
             self._jobs.put_nowait(job)
@@ -381,6 +381,8 @@ class CellService:
                 f"Expected at most {self._jobs.maxsize} requests in line: verify the part, "
                 "nothing of it was recorded."
             ) from None
+        if not self._thread.is_alive():  # it may have ended since
+            self._refuse_jobs()
         return job.future
 
     async def read(self, work: Callable[[SqlStore], T]) -> T:
@@ -396,7 +398,7 @@ class CellService:
         and whatever `work` raises.
         """
         with suppress(NotTakenError):
-            await self.call(lambda engine: engine.flush(), read_only=True)
+            await self.call(DataEngine.flush, read_only=True)
         if self.read_store is self.engine.store:
             return await self.call(lambda engine: work(engine.store), read_only=True)
         return await asyncio.to_thread(work, self.read_store)
@@ -472,16 +474,22 @@ class CellService:
             with suppress(queue.Full):
                 self._jobs.put(None, timeout=IDLE_WAIT)
                 self._thread.join()
-        with suppress(queue.Empty):
-            while True:
-                job = self._jobs.get_nowait()
-                # A request may have been queued while the service began to close.
-                if job is not None and job.future.set_running_or_notify_cancel():
-                    job.future.set_exception(BusyError(CLOSING))
+        self._refuse_jobs()
         self._timeout_threads.shutdown()
         self.end_listening()
         if self.read_store is not self.engine.store:
             self.read_store.close()
+
+    def _refuse_jobs(self) -> None:
+        """Empty the queue of an engine's thread that has ended; the futures raise BusyError.
+
+        A request may be queued while the service closes, and also after `close` has called this.
+        """
+        with suppress(queue.Empty):
+            while True:
+                job = self._jobs.get_nowait()
+                if job is not None and job.future.set_running_or_notify_cancel():
+                    job.future.set_exception(BusyError(CLOSING))
 
     def _notify_observers(self, response: T) -> T:
         """Call each function in `observers` with a response or a `RetrainReport`; return it.

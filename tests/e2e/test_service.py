@@ -116,3 +116,12 @@ def test_a_service_whose_thread_died_behind_a_full_line_closes_all_the_same():
     assert not closing_thread.is_alive()
     with pytest.raises(BusyError):
         unanswered.result(0)
+
+
+def test_a_request_in_the_instant_of_the_close_is_refused(monkeypatch):
+    service = CellService(lambda: DataEngine("pca"))
+    monkeypatch.setattr(
+        queue.Queue, "put_nowait", lambda jobs, job: (service.close(), jobs.put(job))
+    )
+    with pytest.raises(BusyError):
+        service.submit(lambda engine, late: None).result(0)
