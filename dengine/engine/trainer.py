@@ -9,6 +9,7 @@ training or of the executor stops the cell.
 import time
 from collections import deque
 from concurrent.futures import BrokenExecutor, Executor, Future
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import Any, Protocol, Self, runtime_checkable
 
@@ -50,7 +51,7 @@ class TrainingWindow:
 
     def __init__(self, capacity: int) -> None:
         self.capacity = capacity
-        nothing = np.zeros(0, np.int64)
+        nothing = _no_numbers()
         self.refill(LabelledTraces(nothing, NO_TRACES, np.zeros(0, np.int8), nothing))
 
     def refill(self, labelled: LabelledTraces) -> None:
@@ -403,42 +404,46 @@ class Retrainer:
         is logged. The outcome of a training that was given up or failed has no model and says why.
         An executor that died or hangs is started again if it can be. Otherwise retrains run without
         it: from then on if it died, else until it is free. `begin` of the outcome is now minus the
-        duration of the training. How long the training took for its last optimiser step and the
-        work after it is remembered: the longest of the newest 20 is reserved in the time budget of
-        the next.
+        duration of the training. If it has an outcome, how long it took for its last optimiser step
+        and the work after it is remembered: the longest of the newest 20 is reserved in the time
+        budget of the next.
         """
         future = self.future
         left = self._count_seconds_left()
         if future is None or not (future.done() or wait > 0.0 or left <= 0.0):
             return None
+        with suppress(Exception):  # it is raised again below
+            future.result(timeout=max(0.0, min(wait, left)))
+        is_done = future.done()
         try:
-            trained = future.result(timeout=max(0.0, min(wait, left)))
+            trained = future.result(timeout=0.0)
+            self._last_seconds.append(trained.last_seconds)
         except Exception as error:  # the failure is recorded, and the old version goes on answering
-            trained = Trained(None, self._give_up(future, error), seq=self._seq)
+            trained = Trained(None, self._give_up(is_done, error), seq=self._seq)
         self.future = None
-        self._last_seconds.append(trained.last_seconds)
         return replace(trained, begin=self.clock() - trained.seconds)
 
-    def _give_up(self, future: Future[Trained], error: Exception) -> str:
+    def _give_up(self, is_done: bool, error: Exception) -> str:
         """Log why a training failed, and return it as the reason of a dropped retrain.
 
-        `error` is what the training, or waiting for it, raised; the reason begins with "dropped: ".
-        If the training is not done and its executor lives, it is discarded: its result is lost, and
-        it never begins, or goes on until it ends if it has begun. An executor that died, or in
-        which a training hangs, is started again or taken out of use (`_replace_executor`).
+        `error` is what the training, or waiting for it, raised, and `is_done` says whether the
+        training was done by then. The reason begins with "dropped: ". If it was not done and its
+        executor lives, it is discarded: its result is lost, and it never begins, or goes on until
+        it ends if it has begun. An executor that died, or in which a training hangs, is started
+        again or taken out of use (`_replace_executor`).
         """
         is_broken = isinstance(error, BrokenExecutor)
-        training_raised = future.done() and not is_broken
+        training_raised = is_done and not is_broken
         log.error("a retrain in the executor failed: %s", error, exc_info=training_raised)
+        reason = reason_of(error)
         if training_raised:
-            return f"dropped: {reason_of(error)}"
-        failure = f"{type(error).__name__}: {error}"
+            return f"dropped: {reason}"
         if not is_broken:
             self.discard()
-            failure = f"not done after {time.monotonic() - self._began:.0f} s in the executor."
+            reason = f"not done after {time.monotonic() - self._began:.0f} s in the executor."
         if is_broken or self._count_seconds_left() <= 0.0:
             self._replace_executor()
-        return f"dropped: RuntimeError: {failure}"
+        return f"dropped: RuntimeError: {reason}"
 
     def _replace_executor(self) -> None:
         """Restart the executor if it is a `RestartableExecutor`; otherwise go on without it.

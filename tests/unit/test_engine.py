@@ -282,6 +282,20 @@ def test_a_training_counts_as_hung_only_from_when_a_discarded_one_is_done(monkey
     assert retrainer.future is waiting
 
 
+def test_a_training_that_ends_right_after_the_timeout_is_taken_and_a_failure_has_no_duration(
+    monkeypatch,
+):
+    monkeypatch.setattr(trainer, "N_REMEMBERED", 1)
+    slow, executor = trainer.Trained(None, "accepted", last_seconds=0.6), Mock()
+    executor.submit().result.side_effect = [TimeoutError, slow, OSError, OSError]
+    retrainer = trainer.Retrainer(trainer.TrainingWindow(10), 1.0, None, executor)
+    for reason in ("accepted", "dropped: OSError: "):
+        retrainer.start(Mock())
+        assert retrainer.collect(wait=1.0).reason == reason
+    retrainer.start(Mock())
+    assert executor.submit.call_args.args[3] == 0.4  # seconds, since the slow one needed 0.6
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "words", ["DataEngine()", "next(DataEngine(executor=Pool(1)).run(ReplayCell('insertion'), 1))"]
