@@ -20,6 +20,7 @@ from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from multiprocessing.connection import wait
+from multiprocessing.context import SpawnContext, SpawnProcess
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -55,10 +56,10 @@ class RetrainingProcess(Executor):
         `ready` is set to a new future, which is done when the modules are imported, and fails if
         they cannot be or the process ends before. Raises OSError if the process cannot be started.
         """
-        self._pool = ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), _prepare_process)
-        other_processes = set(multiprocessing.active_children())
+        context = _Spawning()
+        self._pool = ProcessPoolExecutor(1, context, _prepare_process)
         self.ready = self._pool.submit(_warm_up)
-        (self._process,) = set(multiprocessing.active_children()) - other_processes
+        self._process = context.process
 
     def restart(self) -> None:
         """Kill the process, also at work, and start another; raises OSError if that fails.
@@ -89,6 +90,18 @@ class RetrainingProcess(Executor):
         """
         self._process.kill()
         self._pool.shutdown(wait, cancel_futures=cancel_futures)
+
+
+class _Spawning(SpawnContext):
+    """Makes the processes of a pool, and keeps the newest as `process`.
+
+    Other threads may start processes, too, so `multiprocessing.active_children` does not tell.
+    """
+
+    def Process(self, **options: Any) -> SpawnProcess:  # type: ignore[override]  # noqa: N802
+        """Return a new process, which is not started; the pool calls this."""
+        self.process = SpawnProcess(**options)
+        return self.process
 
 
 class _SharedPickle:
@@ -129,7 +142,7 @@ def _unpickle(path: str) -> Any:
 _NEWEST_RESULTS: deque[_SharedPickle] = deque(maxlen=2)  # a discarded one, and the next
 
 
-def _call(call: tuple[Callable[..., Any], tuple[Any, ...], dict[str, Any]]) -> _SharedPickle:
+def _call(call: tuple[Any, ...]) -> _SharedPickle:
     """Call a function, in the retraining process, and return its result for pickling.
 
     `call` is the function, its arguments and its keyword arguments. The result is kept until two
