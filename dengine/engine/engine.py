@@ -823,7 +823,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
             executor, then through its test and the store into force. Another retrain is begun only
             if none is under way then. If the executor cannot begin yet, `poll` or `report` begins
             it. Without an executor, or if the executor takes no work because it died or hangs, the
-            retrain runs in this thread, and its report is returned.
+            retrain runs in this thread, and its report is returned. Nothing is begun if another
+            cell of the product pinned a version of which this cell had not heard yet.
 
         Returns
         -------

@@ -205,8 +205,8 @@ class Learner:
         of the traces), and takes in what other cells of the product (robot cells that share labels
         and versions) stored (a newer version, changes of labels, and labels), since these may
         change what the training starts from. Then new labels count from zero, and the training
-        begins. Whether a rollback pinned the version in force, so that no retrain should replace
-        it, is not checked.
+        begins. If a rollback in another cell has just pinned a version, so that no retrain should
+        replace it, nothing begins with `wait` False; with `wait` True it is released first.
 
         With `wait` True, or if no executor takes work (none is there, or it died or hangs), all is
         done in this thread, which then has one torch thread, and the report is returned. Otherwise
@@ -233,6 +233,10 @@ class Learner:
         begin = self._clock()
         self.wait_until_precomputed()
         self._hear_of_peers()
+        if self.live.pinned:  # by a peer, just now
+            if not wait:
+                return None
+            self.release("")
         self.feedback.count_new_labels(self._window.newest_seq)
         self._is_requested = False
         start = self._choose_start()

@@ -244,6 +244,7 @@ def test_no_cell_replaces_what_a_peer_rolled_back_to_before_one_of_them_releases
         third = fleet.engine("c", executor=executor)
         third.retrain(wait=False)  # it does not know of the rollback
         first.rollback(1)
+        second.retrain(wait=False)  # it hears of the rollback only now
         executor.shutdown()
     pinned, cells = first.version, (third, second, first)
     for engine, start in zip(cells, (60, 61, 100), strict=True):
@@ -257,6 +258,9 @@ def test_no_cell_replaces_what_a_peer_rolled_back_to_before_one_of_them_releases
         engine.poll()
         assert engine.version > pinned
         assert engine.status().pinned == 0
+    first.rollback(1)
+    second.retrain()  # which somebody asked for
+    assert second.store.events.newest(1)[0].kind == "release"
 
 
 @ON_BOTH
