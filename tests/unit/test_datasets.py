@@ -68,9 +68,9 @@ def test_an_archive_without_traces_is_refused_or_asked_for(saved):
         describe(saved())
 
 
-@pytest.mark.parametrize("source", [(1, 2), None, "x" * 300, "a\0b"])
+@pytest.mark.parametrize("source", [(1, 2), None, "insertion", "x" * 300, "a\0b"])
 def test_what_is_no_file_folder_or_table_is_refused(source):
-    match = r"a file, a folder or a DataFrame.* no description"
+    match = r"a file, a folder or a DataFrame.* take no description, and no key"
     with pytest.raises(DataError, match=match):
         describe(source)
     with pytest.raises(DataError, match=match):

@@ -72,7 +72,7 @@ def as_source(source: Any) -> Any:
         f"Expected a file, a folder or a DataFrame, got {shortened(str(source))}",
         TypeError,
         *BAD,
-        do='"insertion" and arrays in memory need no description',
+        do='"insertion" and arrays in memory take no description, and no key of one',
     ):
         Path(source).stat()
         return Path(source)
