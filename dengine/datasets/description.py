@@ -447,7 +447,7 @@ class Description:
 
         The keys `column`, `path`, `line`, `topic` and `listing` (a file with a row for each
         recording or part) in `[label]` say where the label stands: stating one or more clears the
-        others, also the `column` of a listing; likewise with `column`, `path` and `line` in
+        others, but a listing keeps the `column`; likewise with `column`, `path` and `line` in
         `[part]`. Words for good and bad stay. Stating a channel replaces the channel `?`, which
         stands there while none is known. In `rows.NAME.keep`, `channels.NAME.unit` and keys like
         these (that end in drop, invalid, factor or limit) the name of a column may have dots; any
@@ -461,7 +461,8 @@ class Description:
         for section in ("label", "part"):
             if any(f"{section}.{source}" in stated for source in SOURCES):
                 for source in SOURCES:
-                    values.get(section, {}).pop(source, None)
+                    if source != "column" or f"{section}.listing" not in stated:
+                        values.get(section, {}).pop(source, None)
         for name, value in deepcopy(stated).items():
             of_column = OF_COLUMN.fullmatch(name)
             *steps, last = of_column.groups() if of_column else name.split(".", 1)

@@ -407,6 +407,11 @@ def test_a_stated_value_that_cannot_be_is_refused(tmp_path, line):
         load_dataset(tmp_path, saved or describe(tmp_path, stated))
 
 
+def test_another_listing_that_is_stated_keeps_the_column():
+    description = Description(label=LabelSource("verdict", listing="list.csv"))
+    assert description.with_values({"label.listing": "other.csv"}).label.column == "verdict"
+
+
 @QUICK
 @given(*[st.text(min_size=1)] * 5)
 def test_a_description_comes_back_from_its_toml(name, unit, word, pattern, note):
