@@ -32,7 +32,9 @@ def stem_of(description: Description, path: str) -> str:
     path = without_suffix(path)
     for source in description.labels:
         if source.path:
-            path = re.sub(source.path, lambda match: match[0].replace(match[1] or "", "", 1), path)
+            for match in reversed([*re.finditer(source.path, path)]):
+                # Both are -1 if the group has no match: the path stays.
+                path = path[: match.start(1)] + path[match.end(1) :]
     return path
 
 
