@@ -12,7 +12,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from ..decision.intervals import SORTING_GUARANTEES
 from ..decision.members import SAFE_MODES
 from ..decision.policy import Policy
 from ..errors import ReportError, capitalized, expect, listed
@@ -145,8 +144,9 @@ class Corrections:
         (stored,) = self._find_labelled([decision_id])
         id_ = stored.decision.id
         if stored.success is label:
-            text = f"Decision {id_} counts as a {LABEL_TEXTS[label]} already"
-            return self._as_unchanged("correct", text)
+            return self._as_unchanged(
+                "correct", f"Decision {id_} counts as a {LABEL_TEXTS[label]} already"
+            )
         before = "forgotten" if stored.success is None else f"a {LABEL_TEXTS[stored.success]}"
         text = f"decision {id_} counts as a {LABEL_TEXTS[label]}, was {before}"
         return self._change_labels(
@@ -221,8 +221,10 @@ class Corrections:
         forgotten = [stored for stored in decisions if stored.success is not None]
         labels = {stored.decision.id: stored.success for stored in forgotten}
         if not labels:
-            ids = [stored.decision.id for stored in decisions]
-            return self._as_unchanged("forget", f"{_labels_are(ids)} forgotten already")
+            return self._as_unchanged(
+                "forget",
+                f"{_labels_are([stored.decision.id for stored in decisions])} forgotten already",
+            )
         text = f"{_labels_are(list(labels))} forgotten" + (f": {reason}" if reason else "")
         data = {
             "decisions": {id_: {"was": label, "now": None} for id_, label in labels.items()},
@@ -351,10 +353,11 @@ class Corrections:
 
         The decision rule turns bounds into actions, and may learn from outcomes. It starts anew if
         the policy's alpha, lower_bound, interval, guarantee, stops or prices change. Under the
-        guarantees "pooled" and "cost" with stops="some" it also starts anew if the audit rate (the
-        share of certain decisions, accepts and rejects, that are checked all the same) changes. A
-        new rule is updated only with decisions from now on, because a tolerance that was chosen
-        after the data was seen cannot be tested on that data, and old bounds have another scale.
+        guarantees "pooled" and "cost", and a user's subclasses of their rules, with stops="some" it
+        also starts anew if the audit rate (the share of certain decisions, accepts and rejects,
+        that are checked all the same) changes. A new rule is updated only with decisions from now
+        on, because a tolerance that was chosen after the data was seen cannot be tested on that
+        data, and old bounds have another scale.
         `certificate`, which bounds the probabilities that an accept or a reject is wrong, counts
         the decisions since the last change of the policy, whatever changed. If somebody chooses the
         best of the certificates of m policies, the error probability of that certificate is up to
@@ -418,13 +421,11 @@ class Corrections:
         if is_baseline:
             refuse_idle(sorted(changes.keys() - BASELINE_SETTINGS))
         self._bring_up_to_date()
-        # An audit counts by its inclusion probability, so the pooled evidence must be of one audit
-        # rate.
-        rate_counts = (
-            policy.guarantee in SORTING_GUARANTEES
-            and policy.inclusion_probability != old_policy.inclusion_probability
+        starts_anew = not is_baseline and (
+            any(name in changes for name in SCORING)
+            # Audits count by the inclusion probability, so pooled evidence must be of one rate.
+            or policy.rule().extra_arguments != old_policy.rule().extra_arguments
         )
-        starts_anew = not is_baseline and (rate_counts or any(name in changes for name in SCORING))
         live = self._live
         since = live.next_version
         evidence = present.evidence
@@ -437,10 +438,9 @@ class Corrections:
             evidence=evidence,
         )
         steps = [f"{name} {old_values[name]} -> {value}" for name, value in changes.items()]
-        text = f"the policy's {', '.join(steps)}"
         event = Change(
             POLICY_CHANGED,
-            text,
+            f"the policy's {', '.join(steps)}",
             {"old": old_values, "new": new_values},
             author,
             settings=settings.to_store(),

@@ -194,6 +194,14 @@ def test_the_audit_rate_alone_leaves_the_local_rule_as_it_is(data):
     assert int(engine.model.rule.evidence.level_totals.sum()) == 0
 
 
+def test_another_audit_rate_begins_a_pooled_rule_of_a_user_anew(data):
+    own = "dengine.decision.member_rules:PooledRule"
+    engine = make(POOLED.with_policy(guarantee=own, stops="some"))
+    play(engine, data, 0, 60)
+    engine.set_policy(replace(engine.policy, audit_rate=0.5))
+    assert engine.model.rule.evidence.inclusion_probability == 0.5
+
+
 def test_safe_mode_outlasts_a_change_of_policy_and_ends_by_the_labels_as_they_are_now(
     tmp_path, data
 ):
