@@ -46,7 +46,8 @@ class MemoryStore(Outbox):
         self._note_integrity(store.database.check_pages())
         self.check_integrity()
         self._continue_numbers()
-        store.database.before_use = self._write
+        if not reading:  # another engine may use the store
+            store.database.before_use = self._write
 
     def _write(self) -> None:
         """Write the model versions and the records that wait in memory to the database.

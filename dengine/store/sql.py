@@ -43,7 +43,8 @@ class SqlStore(AbstractContextManager["SqlStore"]):
     url : str or None
         A file (SQLite), or an SQLAlchemy URL of SQLite or PostgreSQL. None: SQLite in memory, for
         replays and trials; such a store stays open after `close`, and is used by one thread at a
-        time.
+        time. As soon as a second engine is opened on it, decisions and labels of the first are not
+        kept any more.
     cell_id : str, default "cell"
         Whose rows these are. Several cells share one database without seeing each other.
     clock : callable

@@ -70,14 +70,16 @@ def test_a_cell_without_one_of_its_four_methods_is_refused_before_the_first_part
         make().run(half, 1)
 
 
-def test_an_engine_that_was_opened_for_reading_neither_decides_nor_learns(data, tmp_path):
-    with make(store=tmp_path / "e.db") as engine:
-        id_ = play(engine, data, 0, 10)[-1].decision.id
-    with DataEngine.open(tmp_path / "e.db", reading=True) as reader:
-        decide, report = partial(reader.decide, data.X[11]), partial(reader.report, id_, True)
-        for call in (reader.poll, reader.retrain, decide, report):
-            with pytest.raises(StoreError, match="opened for reading"):
-                call()
+def test_an_engine_that_was_opened_for_reading_neither_decides_nor_learns_nor_disturbs(data):
+    engine = make()
+    id_ = play(engine, data, 0, 10)[-1].decision.id
+    reader = DataEngine.open(engine.store, reading=True)
+    decide, report = partial(reader.decide, data.X[11]), partial(reader.report, id_, True)
+    for call in (reader.poll, reader.retrain, decide, report):
+        with pytest.raises(StoreError, match="opened for reading"):
+            call()
+    engine.decide(data.X[11])
+    assert engine.store.decisions.counts()["decisions"] == 11
 
 
 def test_a_trace_that_comes_again_has_no_vote_on_itself(trained, data):
