@@ -7,12 +7,14 @@ keys of the proposal with what their notes show, the `set` that completes it, an
 import json
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 
 from dengine.cli.options import parse_stated
 from dengine.datasets import Dataset, describe, load_dataset
+from dengine.datasets.read import places
 from dengine.errors import DataError
 
 CORPUS = Path(__file__).parents[1] / "recordings"
@@ -63,6 +65,13 @@ def test_a_proposal_leaves_open_what_nothing_proves_and_shows_the_candidates(nam
     for key, candidates in expected["open"].items():
         missing = [text for text in candidates if text not in proposal.notes[key]]
         assert not missing, proposal.notes[key]
+
+
+def test_a_proposal_reads_a_listing_once(monkeypatch):
+    read = Mock(wraps=places.read_file)
+    monkeypatch.setattr(places, "read_file", read)
+    describe(CORPUS / "a_listing_tells_the_order/data")
+    read.assert_called_once()
 
 
 @pytest.mark.parametrize("name", REFUSED)

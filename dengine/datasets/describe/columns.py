@@ -5,7 +5,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cache, cached_property
 from itertools import groupby
 from pathlib import Path
 from statistics import mode
@@ -17,6 +17,7 @@ from ...errors import DataError
 from ...records import Floats
 from ..description import Clock, Description, Stated, Strings, TextForm
 from ..read.clock import ISO, times_of
+from ..read.places import ListingReader, listing_table
 from ..read.split import pattern_of, signals_of, word_columns
 from ..table import Cells, Table
 from ..units import bare, unit_in
@@ -215,6 +216,11 @@ class Proposal:
     tables: Tables = ()
     columns: Mapping[str, Column] = field(default_factory=dict)
     notes: dict[str, str] = field(default_factory=dict)
+
+    @cached_property
+    def read_listing(self) -> ListingReader:
+        """Reads the listing of a name, a file beside the recordings, once (see `listing_table`)."""
+        return cache(lambda name: listing_table(self.base / name, self.description.text))
 
     def put(self, key: str, value: Any, note: str = "") -> None:
         """Set a key like `time.column`, with a note on it; does nothing if the user stated it.

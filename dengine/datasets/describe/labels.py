@@ -15,7 +15,7 @@ from ...errors import DataError
 from ..dataset import Faults
 from ..description import SOURCES, UNKNOWN, Description, LabelSource, PartSource
 from ..read.files import caught
-from ..read.places import listing_table, part_of, read_labels, without_suffix
+from ..read.places import part_of, read_labels, without_suffix
 from ..table import Table
 from .columns import MOST_WORDS, Proposal, Tables, counts_of
 
@@ -208,7 +208,7 @@ def sources_of(p: Proposal, paths: Names) -> Iterator[LabelSource]:
     label = p.description.label
     for name in p.others:
         with suppress(DataError, ValueError):
-            table = listing_table(p.base / name, p.description.text)
+            table = p.read_listing(name)
             for key, column in permutations(table.columns, 2):
                 if len({*table.words(key)}) > len(table.lines) / 2:
                     source = replace(label, listing=name, key=key, column=column)
@@ -232,7 +232,7 @@ def words_of(p: Proposal, source: LabelSource, tables: Tables, parts: Words) -> 
     """
     words = dict[str, str]()
     faults: Faults = []
-    reader = read_labels(p.base, source, p.description.text)
+    reader = read_labels(source, p.read_listing)
     for table in tables:
         with caught(faults, table.source):
             words[table.source] = reader.word(table, parts.get(table.source, ""))

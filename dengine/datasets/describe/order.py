@@ -14,7 +14,7 @@ from ...errors import DataError, listed
 from ..description import UNKNOWN, Clock, LabelSource, Strings, TextForm
 from ..read.clock import has_day, times_of
 from ..read.files import HALF_DAY, file_key, is_unsorted, natural_key, sort_key
-from ..read.places import listing_table, stem_of
+from ..read.places import stem_of
 from ..table import Table
 from .columns import Column, Proposal, Tables
 from .labels import Words, lines_of, part_words, tables_of, words_of
@@ -157,8 +157,9 @@ def unsorted_stamps(p: Proposal, tables: Tables, parts: Words) -> Iterator[Label
     sources += [LabelSource(line=line) for line in lines_of(p)]
     for label in p.description.labels:
         with suppress(DataError):  # a label in no listing, or in one that cannot be read
-            listing = listing_table(p.base / label.listing, p.description.text)
-            sources += [replace(label, column=name) for name in listing.columns]
+            sources += [
+                replace(label, column=name) for name in p.read_listing(label.listing).columns
+            ]
     for source in sources:
         words = [*filter(None, words_of(p, source, tables, parts).values())]
         is_fixed = source.listing or source.line or p.columns[source.column].fixed

@@ -4,7 +4,7 @@ header, or in a listing, which is a file with a row for each recording or part.
 
 import re
 from collections import defaultdict
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,6 +17,7 @@ from .files import natural_key, read_file
 from .frames import read_parquet
 from .text import read_text, to_utf8_or_latin
 
+ListingReader = Callable[[str], Table]  # returns the table of the listing of a name
 DELIMITERS = (",", ";", "\t", "|")
 SUFFIX = re.compile(r"\.[A-Za-z]\w{0,7}(\.gz)?$")  # of a file
 MARKS = " \t;,:：=\"'"  # around the words of a line
@@ -265,15 +266,15 @@ def as_key(word: str) -> str:
     return word.lstrip("0") or "0" if word.isdecimal() else word.replace("\\", "/")
 
 
-def read_labels(base: Path, source: LabelSource, form: TextForm) -> LabelReader:
+def read_labels(source: LabelSource, read_listing: ListingReader) -> LabelReader:
     """Return the reader of a source of labels, after reading its listing, if it has one.
 
     The source says where the labels stand, and a listing is a file with a row for each recording or
-    part. It stands in the folder `base`, and is a Parquet file, or a text in the encoding of `form`
-    or else in cp1252 (see `listing_table`). Raises DataError if it cannot be read, or if
-    `source.key` and `source.column`, the columns in it that name the recording or part and have the
-    label, are not both stated and there, and LookupError for an encoding that Python does not know.
-    Whether `source.path` is a regular expression is not checked here.
+    part. `read_listing` is called with its name (see `listing_table`). Raises DataError if it
+    cannot be read, or if `source.key` and `source.column`, the columns in it that name the
+    recording or part and have the label, are not both stated and there, and LookupError for an
+    encoding that Python does not know. Whether `source.path` is a regular expression is not checked
+    here.
     """
     listing = defaultdict[str, set[str]](set)
     if source.listing:
@@ -281,7 +282,7 @@ def read_labels(base: Path, source: LabelSource, form: TextForm) -> LabelReader:
         if not all(columns):
             raise DataError("Expected label.key and label.column, two columns of label.listing.")
         with in_listing(source.listing):
-            table = listing_table(base / source.listing, form)
+            table = read_listing(source.listing)
             for key, word in zip(*map(table.words, columns), strict=True):
                 listing[as_key(key)].add(word)
     return LabelReader(source, listing)

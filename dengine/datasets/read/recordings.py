@@ -24,7 +24,7 @@ from .bags import read_bag
 from .clock import check_steps, times_of
 from .files import caught, find_files, is_unsorted, natural_key, read_file, sort_key
 from .frames import read_frame
-from .places import LabelReader, part_of, read_labels, stem_of
+from .places import LabelReader, listing_table, part_of, read_labels, stem_of
 from .split import split, table_of
 from .windows import cut
 
@@ -219,7 +219,10 @@ def read_recordings(
     check_description(description)
     faults: Faults = []
     name, base, files = files_of(source, description, faults)
-    labels = [read_labels(base, label, description.text) for label in description.labels]
+    labels = [
+        read_labels(label, lambda name: listing_table(base / name, description.text))
+        for label in description.labels
+    ]
     recordings: list[Recording] = []
     n_unlabelled = 0
     for file in files:
