@@ -4,26 +4,23 @@ import re
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from itertools import groupby, pairwise, zip_longest
+from itertools import groupby, zip_longest
 from operator import itemgetter
 from typing import Any
 
-import numpy as np
-
 from ...errors import DataError, listed
-from ..description import UNKNOWN, Clock, LabelSource, Strings, TextForm
-from ..read.clock import has_day, times_of
+from ..description import UNKNOWN, LabelSource, Strings
 from ..read.files import HALF_DAY, file_key, is_unsorted, natural_key, sort_key
 from ..read.places import stem_of
-from ..table import Table
-from .columns import Column, Proposal, Tables
-from .labels import Words, lines_of, part_words, tables_of, words_of
+from .columns import LIKE_A_TIME, Proposal, Tables
+from .labels import lines_of, part_words, tables_of, words_of
 
 STAMP_NAME = re.compile(r"(?i)stamp|created|date|datum|epoch")
 STAMP_WORD = re.compile(r"(.*\d){5}")
-# In s, ms, us or ns since 1970, or like 20240131_235959.
+# A date or a time of day; s, ms, us or ns since 1970; or like 20240131_235959.
 STAMP = re.compile(
-    r"(1\d|2[0-4])\d{8}(\d{3}){0,3}(\.\d*)?|20[0-4]\d[01]\d[0-3]\d[T_ -]?\d{4}(\d\d)?"
+    rf"{LIKE_A_TIME.pattern}|((1\d|2[0-4])\d{{8}}(\d{{3}}){{0,3}}(\.\d*)?"
+    r"|20[0-4]\d[01]\d[0-3]\d[T_ -]?\d{4}(\d\d)?)$"
 )
 YEAR = re.compile(r"20[0-4]\d([01]\d[0-3]\d((\d\d){1,3})?)?")  # with month, day and time of day
 MARK = re.compile(r"[-_. :T/]?")  # between the numbers of a date
@@ -31,7 +28,7 @@ MARK = re.compile(r"[-_. :T/]?")  # between the numbers of a date
 DAY_FIRST = re.compile(
     r"[0-3]?\d[0-3]\d(20)?[0-4]\d[0-2]\d[0-5]\d([0-5]\d)?|[0-3]?\d[0-3]\d20[0-4]\d"
 )
-FEW = 0.15  # of the times of day that may be smaller than the one before, on the next day
+RENAME = "rename the files"
 
 
 def propose_order(p: Proposal) -> None:
@@ -45,9 +42,8 @@ def propose_order(p: Proposal) -> None:
     `?`, names are not looked at.
 
     In this order, or by name if none is certain, parts are then compared. `order` is also `?` if
-    the part numbers fall throughout, are sorted as texts (P10 before P2) or are counters that do
-    not rise, or if a date, time or counter of each recording does not rise (`unsorted_stamps`). If
-    several of these hold, the note is on the last. An `order` that the user stated stays. Raises
+    part numbers, dates, times or counters of the recordings have another order (`unsorted_places`);
+    of several such places the note is on the last. An `order` that the user stated stays. Raises
     SettingError for a malformed `windows.trigger`, the condition at which long recordings are cut.
     """
     about = p.description
@@ -77,16 +73,7 @@ def propose_order(p: Proposal) -> None:
             )
     places = {path: place for place, path in enumerate(files)}
     tables.sort(key=lambda table: places[table.path])
-    parts = part_words(about.part, tables)
-    numbers = [*parts.values()]
-    rising = sorted(numbers, key=natural_key)
-    is_odd = numbers in (sorted(numbers), rising[::-1]) or counter_of(numbers)
-    if numbers != rising and is_odd:
-        name = listed(about.part.column) or "path"
-        p.put("order", UNKNOWN, f"name, or {name}: the part numbers have another order")
-    for source in unsorted_stamps(p, tables, parts):
-        place = source.column or source.line
-        other = place if source.column and not source.listing else "rename the files"
+    for place, other in unsorted_places(p, tables):
         p.put("order", UNKNOWN, f"name, or {other}: {place} has another order")
 
 
@@ -126,33 +113,47 @@ def fits_all(pattern: re.Pattern[str], pieces: Sequence[Any]) -> bool:
     return all(map(pattern.fullmatch, map(str, pieces)))
 
 
-def counter_of(words: Strings) -> list[int]:
-    """Return the numbers by which words are counted, one of each; empty if there are none.
+def is_out_of_order(words: Strings, is_fixed: bool, is_named: bool) -> bool:
+    """Return whether words that seem to rise from recording to recording do not.
 
-    They stand at the first place, counted in runs of digits, at which each word has another number.
-    They count, in any order, if the largest is less than twice as many above the smallest as there
-    are words. No later place is tried. There must be three words or more.
+    Dates and times seem to rise, like 2026-01-31 and 20260131_235959, or seconds since 1970; and in
+    a place that is named like them any words with five digits. They must be in the order of
+    `sort_key`, which cannot order 01/31/26 (`is_unsorted`). So do words of `is_fixed` places that
+    are all different, if they are sorted as texts (P10 before P2) or fall throughout, or if the
+    last numbers in them count the recordings: the largest is less than twice as many above the
+    smallest as there are words.
+
+    words : the word of each recording, in the order to be compared. is_fixed : whether the place
+    has one word for each recording. is_named : whether it is named like a date or time.
     """
-    for row in [*zip_longest(*map(natural_key, words), fillvalue="")][1::2]:
-        if len(words) > 2 and "" not in row and len({*row}) == len(words):
-            return [*row] if max(row) - min(row) < 2 * len(words) else []
-    return []
+    ranks = [*map(sort_key, words)]
+    is_sorted = ranks == sorted(ranks)
+    if all(map(STAMP.match, words)) or (is_named and all(map(STAMP_WORD.match, words))):
+        return not is_sorted or any(map(is_unsorted, words))
+    if is_sorted or not is_fixed or len({*words}) < len(words):
+        return False
+    if words == sorted(words) or ranks == sorted(ranks, reverse=True):
+        return True
+    counts = [rank[-2] for rank in ranks if len(rank) > 1]
+    is_count = len({*counts}) == len(words) > 2
+    return is_count and max(counts) - min(counts) < 2 * len(words)
 
 
-def unsorted_stamps(p: Proposal, tables: Tables, parts: Words) -> Iterator[LabelSource]:
-    """Yield each place with a date, time or counter for each recording, that is out of order.
+def unsorted_places(p: Proposal, tables: Tables) -> Iterator[tuple[str, str]]:
+    """Yield each place whose words rise in another order than the recordings, and the `order` then.
 
-    The places are columns without another use, lines above the header of the first table, and
-    columns of listings of labels. A recording's word is its text in a place; in a column of its
-    table, the cell of the first row; empty ones are left out. A place counts if its words are dates
-    or times (`stamps_of`; its name may say so, like `timestamp` or `created`). Otherwise it counts
-    if it does not change within a recording, and a number in its words counts the recordings
-    (`counter_of`). Equal words are in order, and if several forms of dates fit, one in which they
-    are in order is enough. `p` is the description so far. Raises SettingError for a malformed
-    `windows.trigger`, the condition at which long recordings are cut.
+    The places are the part numbers, columns without another use, lines above the header of the
+    first table, and columns of listings of labels. A recording's word is its text in a place; in a
+    column of its table, the cell of the first row; empty ones are left out. The `order` is a column
+    of the tables, or else a text that says what to do. `p` is the description so far. Raises
+    SettingError for a malformed `windows.trigger`, the condition at which long recordings are cut.
 
-    tables : the table of each recording, in the order to be compared. parts : their part numbers.
+    tables : the table of each recording, in the order to be compared.
     """
+    part = p.description.part
+    parts = part_words(part, tables)
+    if is_out_of_order([*parts.values()], True, False):
+        yield "part", listed(part.column) or RENAME
     sources = [LabelSource(column=column.name, at="first") for column in p.unused]
     sources += [LabelSource(line=line) for line in lines_of(p)]
     for label in p.description.labels:
@@ -162,32 +163,8 @@ def unsorted_stamps(p: Proposal, tables: Tables, parts: Words) -> Iterator[Label
             ]
     for source in sources:
         words = [*filter(None, words_of(p, source, tables, parts).values())]
-        is_fixed = source.listing or source.line or p.columns[source.column].fixed
-        ranks = [*stamps_of(words, STAMP_NAME.search(source.column or source.line) is not None)]
-        if is_fixed and not ranks and (counter := counter_of(words)):
-            ranks = [counter]
-        if ranks and all(rank != sorted(rank) for rank in ranks):
-            yield source
-
-
-def stamps_of(words: Strings, is_named: bool) -> Iterator[list[Any]]:
-    """Yield what words are sorted by if they are dates or times, for each form that fits.
-
-    If no form of dates and times fits, words are sorted as `sort_key` sorts them if all are like
-    numbers of seconds since 1970 or like 20240131_235959; also, in a place that is named like a
-    date or time, if all have five digits and none is `is_unsorted`. For others nothing is yielded.
-    Times of day without a date are yielded sorted if at most 15 % (`FEW`) are smaller than the one
-    before, because the next day begins.
-
-    is_named : whether the place of the words is named like a date or time.
-    """
-    cells = Table("", {"": np.array(words, dtype=object)}, [])
-    forms = Column("", [cells], TextForm()).forms if words else []
-    for form in forms:
-        with suppress(DataError):  # a word far behind may be no time
-            times = times_of(cells, Clock(("",), (form,)), TextForm()).tolist()
-            n_falls = sum(a > b for a, b in pairwise(times))
-            yield times if has_day(form) or n_falls > FEW * len(times) else sorted(times)
-    is_stamp = all(map(STAMP.fullmatch, words)) or (is_named and not any(map(is_unsorted, words)))
-    if is_stamp and not forms and all(map(STAMP_WORD.match, words)):
-        yield [*map(sort_key, words)]
+        is_column = source.column and not source.listing
+        is_fixed = not is_column or bool(p.columns[source.column].fixed)
+        place = source.column or source.line
+        if is_out_of_order(words, is_fixed, STAMP_NAME.search(place) is not None):
+            yield place, source.column if is_column else RENAME
