@@ -63,7 +63,6 @@ PLACES = (  # of any words: folders, and the words of a file's name, counted fro
 # What ends the beginning of a line: a mark, two blanks, or the blank before a date.
 NAME_END = re.compile(r"[;:：=\t,]|  |(?<=[^\W\d]) (?=\d+[-./]\d+[-./]\d)")
 LISTED = re.compile(r"\((?!\?)(?:[\w /|-]|\\\W)+\)")  # a group of words, with escaped marks
-OWN = ("npz", "y", (), {"0", "1"})  # labels as dengine's own archives have them
 NO_LABEL = "none was found that is certain: state label.column, path, line or listing"
 Names = Iterable[str]
 Words = Mapping[str, str]  # by recording
@@ -259,11 +258,10 @@ def count_sources(p: Proposal, stated: Sequence[LabelSource]) -> dict[LabelSourc
     source with the same words as an earlier one counts only if it is named like a verdict
     (`is_named_like_verdict`). For listings and paths all recordings count, since their names are
     enough; for columns and lines only those whose tables were looked at (`p.tables`). The words are
-    sorted into good, bad and unchecked as `with_meanings` does; but in the layout `npz`, an archive
-    of all parts, 1 is good and 0 is bad in an array y of 1 and 0, unless `label.good` or
-    `label.bad` is stated. Raises DataError if the stated source has no words or cannot be read, or,
-    if none is stated, if cells of a column without another use are lists; and SettingError for a
-    malformed `windows.trigger`, the condition at which long recordings are cut.
+    sorted into good, bad and unchecked as `with_meanings` does. Raises DataError if the stated
+    source has no words or cannot be read, or, if none is stated, if cells of a column without
+    another use are lists; and SettingError for a malformed `windows.trigger`, the condition at
+    which long recordings are cut.
 
     stated : the source that the user stated, `[label]`; empty if there is none.
     """
@@ -275,11 +273,17 @@ def count_sources(p: Proposal, stated: Sequence[LabelSource]) -> dict[LabelSourc
         is_new = words not in counted.values() or is_named_like_verdict(source)
         is_common = 2 * len(words) > len(tables if source.listing or source.path else p.tables)
         if stated or (is_new and is_common and may_be_labels(source, words.values())):
-            meanings = source.good + source.bad
-            if (p.description.layout, source.column, meanings, {*words.values()}) == OWN:
-                source = replace(source, good=("1",), bad=("0",))
             counted[with_meanings(source, words.values())] = words
     return counted
+
+
+def n_contradictions(source: LabelSource, words: Words, other: LabelSource, others: Words) -> int:
+    """Return how many recordings are good by one source of labels and bad by the other.
+
+    words, others : the word of each recording in either source.
+    """
+    pairs = ((word, others.get(name, "")) for name, word in words.items())
+    return sum({source.meanings.get(a), other.meanings.get(b)} == {0, 1} for a, b in pairs)
 
 
 def propose_label(p: Proposal) -> None:
@@ -305,22 +309,16 @@ def propose_label(p: Proposal) -> None:
     stated = [label] if any(getattr(label, kind) for kind in SOURCES) else []
     counted = count_sources(p, stated)
     named = [source for source in counted if stated or is_named_like_verdict(source)]
-    meanings = {
-        source: {name: source.meanings.get(word, UNKNOWN) for name, word in words.items()}
-        for source, words in counted.items()
-    }
-    known = [source for source in counted if UNKNOWN not in meanings[source].values()]
+    known = [s for s, words in counted.items() if {*words.values()} <= s.meanings.keys()]
     certain = [s for s in known if s in named and UNKNOWN not in s.good + s.bad]
+    doubt = ""
     if certain:
-        first = meanings[certain[0]]
-        n_odd = max(  # recordings that are good by one source and bad by the other
-            sum({meaning, others.get(name)} == {0, 1} for name, meaning in first.items())
-            for others in meanings.values()
-        )
-        doubt = f"two of these disagree on {n_odd:,} of {len(first):,} recordings" if n_odd else ""
-    else:
-        rivals = {tuple(counted[source].items()) for source in (counted if known else named)}
-        doubt = "" if named and len(rivals) == 1 else NO_LABEL
+        first = counted[certain[0]]
+        n_odd = max(n_contradictions(certain[0], first, *other) for other in counted.items())
+        if n_odd:
+            doubt = f"two of these disagree on {n_odd:,} of {len(first):,} recordings"
+    elif len({tuple(counted[s].items()) for s in (counted if known else named)}) != 1 or not named:
+        doubt = NO_LABEL
     if doubt:
         titles = [*map(title_of, counted, counted.values()), doubt]
         p.put("label.column", UNKNOWN, "; ".join(titles))

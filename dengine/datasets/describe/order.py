@@ -4,8 +4,7 @@ import re
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from itertools import groupby, zip_longest
-from operator import itemgetter
+from itertools import zip_longest
 from typing import Any
 
 from ...errors import DataError, listed
@@ -32,42 +31,33 @@ RENAME = "rename the files"
 
 
 def propose_order(p: Proposal) -> None:
-    """Set `order` in `p` to what is certain: `name`, `path`, or else `?`, with a note.
+    """Set `order` in `p` to what the paths of the files prove, `name` or `path`, else to `?`.
 
-    `p` is the description so far. `name` sorts by file name as it stands, and `path` by the path
-    without words that are labels. An order is certain if its texts without such words prove it
-    (`proves_order`): for `name` the file name and then the path, for `path` the path. If both
-    orders are certain and the same, it is `name`; if they differ, it is `?`. In the layout
-    `columns` the columns' names count in place of files, as they stand. While `label.column` is
-    `?`, names are not looked at.
+    `p` is the description so far. The files are sorted by path without the words in it that are
+    labels; in the layout `columns` the columns' names count in place of files, as they stand. If
+    this proves the order (`proves_order`), it is `name` if file names give the same order, else
+    `path`; if not, it is `?`, with a note. While `label.column` is `?`, paths are not looked at.
 
-    In this order, or by name if none is certain, parts are then compared. `order` is also `?` if
-    part numbers, dates, times or counters of the recordings have another order (`unsorted_places`);
-    of several such places the note is on the last. An `order` that the user stated stays. Raises
-    SettingError for a malformed `windows.trigger`, the condition at which long recordings are cut.
+    In this order parts are then compared. `order` is also `?` if part numbers, dates, times or
+    counters of the recordings have another order (`unsorted_places`); of several such places the
+    note is on the last. An `order` that the user stated stays. Raises SettingError for a malformed
+    `windows.trigger`, the condition at which long recordings are cut.
     """
     about = p.description
     tables = tables_of(p)
     stems = {table.path: stem_of(about, table.path) for table in tables}
-    # The numbers in folders may contradict those in the names.
-    names = {path: f"{stem.rpartition('/')[2]} {stem}" for path, stem in stems.items()}
-    by_name = [*stems] if about.layout == "columns" else sorted(stems, key=file_key)
-    by_path = sorted(stems, key=lambda path: natural_key(stems[path]))
-    proved = {
-        order: files
-        for order, files, texts in (("name", by_name, names), ("path", by_path, stems))
-        if proves_order([texts[path] for path in files])
-    }
-    files = [*proved.values(), by_name][0]
+    files = [*stems]
+    if about.layout != "columns":
+        files.sort(key=lambda path: natural_key(stems[path]))
     # While it is open where the label stands, any folder or word may be one of a verdict.
     if about.label.column != UNKNOWN:
-        if proved and all(other == files for other in proved.values()):
-            p.put("order", next(iter(proved)))
+        if proves_order([stems[path] for path in files]):
+            p.put("order", "name" if files == sorted(files, key=file_key) else "path")
         else:
             p.put(
                 "order",
                 UNKNOWN,
-                f"name: by file name, or path: folder by folder; {listed(by_name[:3])} prove "
+                f"name: by file name, or path: folder by folder; {listed(files[:3])} prove "
                 "neither. If both are wrong, rename the files: a number, or year, month and day in "
                 "front",
             )
@@ -82,11 +72,12 @@ def proves_order(names: Strings) -> bool:
 
     The date is the first number that is a year from 2000 to 2049, or begins with one (20240131), in
     all names, together with the numbers behind it if only marks like `-` or `/` stand between them.
-    Dates must never fall. If the names first differ in the date, the names of one date must prove
-    their order, too. If they first differ in another number, it must be distinct in each name and
-    rise, and so must any other number that is distinct in each. 31.12.2025 is read with the year
-    first; other numbers with the day first (010324080000), and AM and PM, prove nothing. If all
-    names are equal, no other order is possible.
+    If the names first differ in the date, it must be another one in each, and rise: 2024-01-31_1
+    before 2024-01-31_2, but not 2024-01-31/P1_1 before 2024-01-31/P2_1. If they first differ in
+    another number, dates must not fall, and this number must be distinct in each name and rise, and
+    so must any other number that is distinct in each. 31.12.2025 is read with the year first; other
+    numbers with the day first (010324080000), and AM and PM, prove nothing. If all names are equal,
+    no other order is possible.
     """
     if len({*names}) == 1:
         return True
@@ -100,8 +91,7 @@ def proves_order(names: Strings) -> bool:
         return False
     first = next(i for i, row in enumerate(pieces) if len({*row}) > 1)
     if begin <= first <= end:
-        days = groupby(zip(dates, names, strict=True), itemgetter(0))
-        return all(proves_order([name for _, name in day]) for _, day in days)
+        return len({*dates}) == len(names)
     numbers = pieces[1:begin:2] + pieces[end + 2 :: 2]
     counters = [row for row in numbers if "" not in row and len({*row}) == len(names)]
     is_odd = any([*row] != sorted(row) or fits_all(DAY_FIRST, row) for row in counters)
