@@ -67,12 +67,11 @@ def columns_of(prefix: str, value: Any) -> Columns:
     """Return a value of JSON or NumPy as columns by name; a scalar becomes a column with one cell.
 
     A list of scalars becomes one column, a mapping has a column for each key, and a list of
-    mappings one for each key of the first of them; but if they are curves with names, like
-    `{"name": "force", "data": [...]}`, one for each name and key (see `_turned`). An array or list
-    of lists (C, n) with C <= n, or (n, C) with C < n, has a column for each of its C channels.
-    Nested values are treated in the same way; an empty list is a column without cells, an empty
-    mapping none. Raises UnreadableError if a list whose first item is a list or mapping has an item
-    of another kind, a mapping without a key of the first, or lists of different lengths.
+    mappings one for each key of the first of them. An array or list of lists (C, n) with C <= n, or
+    (n, C) with C < n, has a column for each of its C channels. Nested values are treated in the
+    same way; an empty list is a column without cells, an empty mapping none. Raises UnreadableError
+    if a list whose first item is a list or mapping has an item of another kind, a mapping without a
+    key of the first, or lists of different lengths, or if the first of its mappings has a list.
 
     prefix : the name of the value; a dot and the key, or the channel from 0, are appended. Without
     a name, "", a column is called by the key alone.
@@ -98,29 +97,20 @@ def columns_of(prefix: str, value: Any) -> Columns:
 def _turned(value: Any) -> Mapping[Any, Any] | None:
     """Return a list of mappings as one mapping of lists by key, a list of lists as one by channel.
 
-    But mappings like `{"name": "force", "data": [...]}` are returned unchanged, by their names, if
-    the values under some key are texts that are all different, and a list in the first mapping is
-    longer than there are mappings; the first such key has the names. Otherwise keys that the first
-    mapping lacks are left out.
-
-    The shorter axis of a list of lists is the channels (of equal ones the first), which are
-    numbered from 0. A NumPy array counts as a list. A mapping is returned as it is, and None for
-    any other value, also an empty list. Raises LookupError, TypeError or ValueError if a mapping
-    lacks a key of the first, an item is of another kind, or lists in a list differ in length.
+    Keys that the first mapping lacks are left out. The shorter axis of a list of lists is the
+    channels (of equal ones the first), which are numbered from 0. A NumPy array counts as a list. A
+    mapping is returned as it is, and None for any other value, also an empty list. Raises
+    LookupError, TypeError or ValueError if a mapping lacks a key of the first, an item is of
+    another kind, lists in a list differ in length, or the first mapping has a list.
     """
     if isinstance(value, Mapping):
         return value
     first = value[0] if isinstance(value, ITEMS) and len(value) else None
     if isinstance(first, Mapping):
         columns = {key: [item[key] for item in value] for key in first}
-        n_samples = [len(cells[0]) for cells in columns.values() if isinstance(cells[0], ITEMS)]
-        names = [
-            cells
-            for cells in columns.values()
-            if {*map(type, cells)} == {str} and len({*cells}) == len(value)
-        ]
-        is_named = names and max(n_samples, default=0) > len(value)
-        return dict(zip(names[0], value, strict=True)) if is_named else columns
+        if any(isinstance(cells[0], ITEMS) for cells in columns.values()):
+            raise ValueError("lists within them, see 'Recordings that dengine does not read'")
+        return columns
     if not isinstance(first, ITEMS):
         return None
     x = np.array(value, dtype=object)
