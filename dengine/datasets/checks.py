@@ -23,7 +23,8 @@ def check_description(description: Description) -> None:
     A description says how recordings are read. No key may have the value `?` (not known yet),
     except in `[ignored]` and `[[check]]`. The number of samples of a trace must be 1 or more. There
     must be a channel, and all channels must have the same `limit`, the range of the sensor. If the
-    `order` of the parts is "time", there must be a column of times. The settings in `[time]` and
+    `order` of the parts is "time", there must be a column of times, and a rate if such a column is
+    resampled. The settings in `[time]` and
     `[text]` must be valid, for example name an encoding that Python knows (`check_forms`). Nothing
     else is checked: neither a trigger (the condition at which a part begins) nor a regular
     expression, nor whether columns exist.
@@ -36,6 +37,11 @@ def check_description(description: Description) -> None:
             "traces.samples, the samples of each trace": description.traces.samples > 0,
             "time.column, since the order is time": (
                 description.order != "time" or description.time.column
+            ),
+            "time.rate_hz, at which times are resampled": (
+                description.traces.lengths != "resample"
+                or description.time.rate_hz
+                or not description.time.column
             ),
             "one limit for all channels": len(limits) == 1,
         }

@@ -28,8 +28,7 @@ DAYS = (
     "%d.%m.%y", "%d-%b-%y", "%d-%b-%Y",
 )  # fmt: skip
 TIMES = (
-    "%H:%M:%S.%f", "%H:%M:%S", "%H:%M:%S:%f", "%H:%M",
-    "%I:%M:%S.%f %p", "%I:%M:%S %p", "%I:%M %p",
+    "%H:%M:%S.%f", "%H:%M:%S:%f", "%H:%M", "%I:%M:%S.%f %p", "%I:%M %p",
 )  # fmt: skip
 FORMS = (
     DAY, ISO, *DAYS, *TIMES, "%M:%S.%f", "%Y-%m-%d %H:%M:%S.%f UTC", "%Y-%m-%d %H:%M:%S.%f",
@@ -155,9 +154,8 @@ class Column:
 
         Only those in `FORMS` are tried; the list is empty if none fits, for example because a cell
         is empty. The first 20 cells and the last cell of each recording are looked at. If an ISO
-        date fits, with or without a time of day, it is the only form. Of two forms that differ by a
-        fraction of a second only the one without it counts. A column of datetimes has only the form
-        `iso`. Raises UnreadableError if cells are lists.
+        date fits, with or without a time of day, it is the only form. A column of datetimes has
+        only the form `iso`. Raises UnreadableError if cells are lists.
         """
         if self.tables[0].columns[self.name].dtype.kind == "M":
             return [ISO]
@@ -170,8 +168,6 @@ class Column:
             with suppress(DataError):
                 times_of(table, Clock((self.name,), (form,)), TextForm())
                 forms.append(form)
-        # Of two forms that fit, cells without a fraction have the one without it.
-        forms = [form for form in forms if form.replace(".%f", "") not in {*forms} - {form}]
         return forms[:1] if {DAY, ISO} & {*forms} else forms
 
 

@@ -4,8 +4,6 @@ import re
 from collections import Counter
 from dataclasses import replace
 
-import numpy as np
-
 from ...errors import DataError, listed
 from ..description import ANY, UNKNOWN, Channel, TextForm
 from ..read.split import OBJECTS, longest_list, split
@@ -33,7 +31,7 @@ def layout_of(p: Proposal, files: Tables) -> str:
     that is looked at. The first of these rules that applies decides. Several JSON or .ts files, of
     which the first has one row, are `files` (a part in each), unless this row has 20 or more
     columns like `x0`, `x1`. Such columns (unless a clock with equal steps stands beside them, see
-    `has_even_clock`), or lists of two items or more in the first row of the first table, make it
+    `is_even_clock`), or lists of two items or more in the first row of the first table, make it
     `wide` (a part in each row), or `npz` for an .npz file. It is `long` (a sample in each row) if a
     column of the first table may tell the parts apart (`may_tell_parts`), or if a file has several
     words in a stated `part.column`, the column that tells the parts apart. Several files, of which
@@ -51,7 +49,8 @@ def layout_of(p: Proposal, files: Tables) -> str:
     """
     kind = p.description.format
     first = files[0]
-    is_wide = numbered_columns(first) and not has_even_clock(first)
+    clocks = columns_of(files[:1], p.description.text).values()
+    is_wide = numbered_columns(first) and not any(map(is_even_clock, clocks))
     if kind in OBJECTS and len(p.names) > 1 and len(first.lines) == 1 and not is_wide:
         return "files"
     longest = longest_list(first)
@@ -84,22 +83,15 @@ def layout_of(p: Proposal, files: Tables) -> str:
     return UNKNOWN
 
 
-def has_even_clock(table: Table) -> bool:
-    """Return whether a column that is named like a clock increases in 8 equal steps or more.
+def is_even_clock(column: Column) -> bool:
+    """Return whether a column is named like a clock and increases in 8 equal steps or more.
 
-    All its cells are numbers, with a decimal point or comma, and a step may differ from the median
-    by 1 %. If so, the rows are samples, not parts.
+    All its cells are numbers, and a step may differ from the usual one by 1 %. If so, the rows are
+    samples, not parts.
     """
-    import pandas as pd
-
-    for name, cells in table.columns.items():
-        if CLOCK_NAME.search(name):
-            texts = pd.Series(cells).astype(str).str.replace(",", ".")
-            steps = np.diff(pd.to_numeric(texts, errors="coerce"))
-            usual = float(np.median(steps)) if len(steps) >= LEAST_RUN else 0.0
-            if usual > 0 and are_even(steps, usual):
-                return True
-    return False
+    is_long = CLOCK_NAME.search(column.name) and len(column.steps) >= LEAST_RUN
+    usual = column.usual_step
+    return bool(is_long and usual and are_even(column.steps, usual))
 
 
 def has_long_runs(column: Column) -> bool:

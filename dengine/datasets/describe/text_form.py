@@ -19,7 +19,7 @@ import numpy as np
 from ...errors import DataError, listed
 from ..dataset import Faults
 from ..description import UNKNOWN, Stated, Strings, TextForm
-from ..read.files import caught, natural_key
+from ..read.files import caught
 from ..read.text import BLANK, COMMENT, LATIN, header_names, split_line, to_utf8, to_utf8_or_latin
 from ..table import pattern_of
 from ..units import is_unit
@@ -162,19 +162,15 @@ def _first_row(rows: Rows, width: int) -> int:
 
 
 def is_numbering(cells: Strings) -> bool:
-    """Return whether at least 20 cells are numbers that strictly increase; others are ignored.
+    """Return whether at least 20 cells are numbers that increase evenly; others are ignored.
 
-    They increase in equal steps (within 1 %), or in the order of `natural_key`, which reads 0.25 as
-    0 and 25, and 0.5 as 0 and 5: 9, 10, 12 pass, and 0.25, 0.5, 1.5 do not.
+    They increase in equal steps (within 1 %).
     """
     numbers = [*filter(NUMBER.fullmatch, cells)]
-    if len(numbers) < MOST_NAMES:
-        return False
-    with suppress(ValueError):  # two marks in a number
+    with suppress(ValueError):  # two marks in a number, or none at all
         steps = np.diff([float(number.replace(",", ".")) for number in numbers])
-        if steps.min() > 0 and np.ptp(steps) <= EVEN * steps.max():
-            return True
-    return numbers == sorted({*numbers}, key=natural_key)
+        return len(numbers) >= MOST_NAMES and 0 < steps.max() <= (1 + EVEN) * steps.min()
+    return False
 
 
 def _head_lines(rows: Rows, width: int, stated: Stated) -> tuple[int, int]:
@@ -297,7 +293,7 @@ def _column_names(usual: Look) -> Strings:
     header and one like `column3`. Without a header, or if it has another number of cells, the names
     are `c0`, `c1`, ...; for 20 columns or more it is `x*`, which names all of them. Such a table
     may have a part in each row: if its first column has 2 to 12 different words, all whole numbers,
-    and the second column has more different words, the first is named `class`, before `x*`.
+    it is named `class`, before `x*`.
 
     usual : how a typical file is written, and the cells of its samples.
     """
@@ -310,9 +306,9 @@ def _column_names(usual: Look) -> Strings:
         return header_names([*cells, ""])[:width]
     if width < MOST_NAMES:
         return [f"c{i}" for i in range(width)]
-    firsts, seconds = ({row[i] for row in usual.rows if len(row) > i} for i in (0, 1))
-    is_class = 1 < len(firsts) <= min(MOST_WORDS, len(seconds) - 1)
-    return ["class", "x*"] if is_class and all(map(WHOLE.fullmatch, firsts)) else ["x*"]
+    firsts = {row[0] for row in usual.rows if row}
+    is_class = 1 < len(firsts) <= MOST_WORDS and all(map(WHOLE.fullmatch, firsts))
+    return ["class", "x*"] if is_class else ["x*"]
 
 
 def propose_marks(p: Proposal, cells: Collection[str]) -> None:

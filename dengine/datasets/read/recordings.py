@@ -336,7 +336,7 @@ def dataset_of(recordings: Sequence[Recording], description: Description) -> Dat
     channels = [*description.channels.values()]
     clock = description.time
     fit = description.traces.lengths.removesuffix("-all")
-    is_grid = fit == "resample" and clock.column and clock.rate_hz
+    is_grid = fit == "resample" and clock.column
     return make_dataset(
         X,
         labels,
@@ -356,11 +356,10 @@ def fitted(samples: Floats, seconds: Floats | None, description: Description) ->
     """Return the trace (C, T) of samples (C, n), brought to T samples as `[traces]` says.
 
     This section of the description has T, `samples`, and what happens to another length, `lengths`.
-    `seconds`, shape (n,), has the times of the samples; None without a clock. With `resample`,
-    times and a stated rate, the samples are interpolated at that rate from the first time on. A
-    longer recording loses its end; one that ends up to one step early is accepted, and its last
-    sample repeated. With `resample` and times, but without a rate, the whole recording is
-    interpolated evenly, if it has half to twice T samples. Otherwise it is fitted like a live trace
+    `seconds`, shape (n,), has the times of the samples; None without a clock. With `resample`
+    and times, the samples are interpolated at the stated rate from the first time on. A longer
+    recording loses its end; one that ends up to one step early is accepted, and its last sample
+    repeated. Otherwise it is fitted like a live trace
     (`can_fit_length`, `fit_length`): `strict` takes only T samples, `cut` drops the end, `pad`
     drops the end or repeats the last sample, and `resample` interpolates evenly, both if there are
     half to twice T samples. `pad-all` is like `pad`, but takes any length but 0.
@@ -378,12 +377,9 @@ def fitted(samples: Floats, seconds: Floats | None, description: Description) ->
     wrong = f"Expected {about.samples} samples, got {n}"
     if about.lengths == "resample" and seconds is not None:
         seconds = seconds - seconds[0]
-        times = np.linspace(0, seconds[-1], about.samples)
-        if rate:
-            times = np.arange(about.samples) / rate
-            can_fit = bool(times[-1] <= seconds[-1] + (1 + ROUNDING) / rate)
-            wrong += f", which last {seconds[-1]:.4g} s and not {times[-1]:.4g} s"
-        if can_fit:
+        times = np.arange(about.samples) / rate
+        wrong += f", which last {seconds[-1]:.4g} s and not {times[-1]:.4g} s"
+        if times[-1] <= seconds[-1] + (1 + ROUNDING) / rate:
             return np.stack([np.interp(times, seconds, row) for row in samples]).astype(np.float32)
     elif can_fit:
         return fit_length(torch.from_numpy(samples.astype(np.float32)), about.samples, kind).numpy()
