@@ -13,7 +13,6 @@ from ...errors import DataError, listed
 from ..description import (
     ANY,
     UNKNOWN,
-    LabelSource,
     PartSource,
     RowMeanings,
     RowWords,
@@ -26,7 +25,7 @@ from ..units import quantity_of
 from .clock import COUNTER_NAME, is_clock, propose_clock, propose_rate
 from .clock import NAME as CLOCK_NAME
 from .columns import FORCES, LOST, MOST_WORDS, Column, Proposal, columns_of, counts_of
-from .labels import NAME, has_meaning, lines_of, part_words, propose_label
+from .labels import NAME, lines_of, part_words, propose_label
 from .layout import PART_NAME
 from .order import propose_order
 
@@ -60,29 +59,30 @@ SET_VALUE = re.compile(WORD_BEGINS + r"(set|soll|vorgabe|nominal|target|consigne
 def propose_roles(p: Proposal) -> None:
     """Find what each column is for, and set the keys that say so in `p`.
 
-    The columns are those of `p.tables`. In this order: columns that tell which rows are samples,
-    clock, part, label, channels, and what follows from these: words for lost samples, rate, length
-    of the traces, order of the parts, ignored columns and files. If no rule proves a value, the key
-    is `?`, or stays empty like `[part]` and `[channels]`. If it is open which rows are samples,
-    `traces.samples` is `?` and no rate is set; a clock with `?` gives no rate either, and if its
-    column is `?`, `order` stays as it is. `ignored` becomes the columns without any use, with their
-    units. `exclude` becomes the files in `p.others` without listings of labels, if there are any,
-    unless `exclude` is `?`. Stated keys stay, but a stated `ignored` is replaced, and a stated
-    `[rows]` gets further columns and words (`qualify_rows`, `find_lost`). `p.columns` is set, and
-    `p.tables` loses rows that are no samples. Raises DataError if a stated column of times or
-    channel does not exist, a setting in `[time]` is wrong, a stated source of labels has no words
-    (like `ok`) or cannot be read, or cells are lists, and SettingError for a malformed
-    `windows.trigger`.
+    The columns are those of `p.tables`. In this order: clock, part, label, channels, and what
+    follows from these: words for lost samples, other columns that tell which rows are samples,
+    rate, length of the traces, order of the parts, ignored columns and files. If no rule proves a
+    value, the key is `?`, or stays empty like `[part]` and `[channels]`. If it is open which rows
+    are samples, `traces.samples` is `?` and no rate is set; a clock with `?` gives no rate either,
+    and if its column is `?`, `order` stays as it is. `ignored` becomes the columns without any use,
+    with their units. `exclude` becomes the files in `p.others` without listings of labels, if there
+    are any, unless `exclude` is `?`. Stated keys stay, but a stated `ignored` is replaced, and a
+    stated `[rows]` gets further words and columns (`complete_rows`, `find_lost`, `qualify_rows`).
+    `p.columns` is set, and `p.tables` loses rows that are no samples. Raises DataError if a stated
+    column of times or channel does not exist, a setting in `[time]` is wrong, a stated source of
+    labels has no words (like `ok`) or cannot be read, or cells are lists, and SettingError for a
+    malformed `windows.trigger`.
     """
     p.columns = columns_of(p.tables, p.description.text)
     for name in (*p.description.time.column, *p.description.channels):
         expect_one_of(p.columns, name, "the columns")
-    qualify_rows(p)
+    complete_rows(p)
     propose_clock(p)
     propose_part(p)
     propose_label(p)
     propose_channels(p, {column.name: column.unit for column in p.unused if may_be_channel(column)})
     find_lost(p)
+    qualify_rows(p)
     clock = p.description.time
     if any(UNKNOWN in about.keep for about in p.description.rows.values()):
         p.put("traces.samples", UNKNOWN, "it follows from rows")
@@ -120,18 +120,12 @@ def set_rows(p: Proposal, rows: RowMeanings) -> None:
         p.columns = columns_of(p.tables, p.description.text)
 
 
-def qualify_rows(p: Proposal) -> None:
-    """Find the columns that tell which rows are samples, and set them as `[rows]` in `p`.
+def complete_rows(p: Proposal) -> None:
+    """Add the words that the user did not state to the stated `[rows]` in `p`, and apply it.
 
-    Of the columns that no key of the description uses yet, `qualifies` says which ones they are. If
-    the cells of such a column have several words (texts), its `keep` is `?`, with a note that
-    counts them; if they have only one word, this becomes its `keep`. If the user stated some words
-    of a column, its other words are added to `keep`, or to `drop` if `keep` is stated. If there are
-    more than 12 others, `*` is added in their place; if `*` is stated, nothing is added. Rows that
-    are no samples are left out of `p.tables` and `p.columns`, and so are whole recordings whose
-    only cell in such a column is in `drop`, unless these are all recordings; but no rows are left
-    out while a `keep` is `?`, nor those of a recording that lacks a column of `[rows]`. Raises
-    UnreadableError if cells are lists, and SettingError for a malformed `windows.trigger`.
+    The other words of a column are added to `keep`, or to `drop` if `keep` is stated; `*` in their
+    place if they are more than 12, and nothing if `*` is stated. Rows that are no samples are left
+    out of `p.tables` and `p.columns` (see `set_rows`).
     """
     rows = dict(p.description.rows)
     for name in rows.keys() & p.columns.keys():
@@ -142,49 +136,66 @@ def qualify_rows(p: Proposal) -> None:
         if ANY not in named:
             key = "drop" if about.keep else "keep"
             rows[name] = replace(about, **{key: getattr(about, key) + words})
-    n_rows = max(column.counts.total() for column in p.columns.values())
-    for column in p.unused:
-        if not qualifies(column, n_rows):
-            continue
-        words = tuple(column.counts)
-        if len(words) > 1:
-            p.notes[f"rows.{column.name}.keep"] = (
-                f"which rows are samples? {counts_of(column.counts)}; others drop or invalid; if "
-                "one row has the label, state label.column, and label.at as first or last"
-            )
-            words = (UNKNOWN,)
-        rows[column.name] = RowWords(words)
     set_rows(p, rows)
 
 
-def qualifies(column: Column, n_rows: int) -> bool:
+def qualify_rows(p: Proposal) -> None:
+    """Set `[rows]` in `p` for the columns without another use that tell which rows are samples.
+
+    `may_qualify` says which ones they are. If the cells of such a column have several words, its
+    `keep` is `?`, with a note that counts them; if they have only one word, this becomes its
+    `keep`. Raises UnreadableError if cells are lists, and SettingError for a malformed
+    `windows.trigger`.
+    """
+    rows = dict(p.description.rows)
+    n_rows = max(column.counts.total() for column in p.columns.values())
+    for column in p.unused:
+        if may_qualify(column, n_rows):
+            words = tuple(column.counts)
+            if len(words) > 1:
+                p.notes[f"rows.{column.name}.keep"] = (
+                    f"which rows are samples? {counts_of(column.odd or column.counts)}; others "
+                    "drop or invalid; * is any other word; if one row has the label, state "
+                    "label.column, and label.at as first or last"
+                )
+                words = (UNKNOWN,)
+            rows[column.name] = RowWords(words)
+    p.description = replace(p.description, rows=rows)
+
+
+def is_status(column: Column) -> bool:
+    """Return whether a column is named like a status or verdict, and has at most 12 words or texts.
+
+    With texts, other than those for lost values (`LOST`), there may be more words.
+    """
+    is_named = QUALIFIER_NAME.search(column.name) or NAME.fullmatch(column.name)
+    return bool(is_named and (texts_of(column) or len(column.counts) <= MOST_WORDS))
+
+
+def texts_of(column: Column) -> set[str]:
+    """Return the words of a column that are neither numbers nor stand for a lost value."""
+    return {word for word in column.odd if word.lower() not in LOST}
+
+
+def may_qualify(column: Column, n_rows: int) -> bool:
     """Return whether the words of a column may tell which rows are samples.
 
     It must have a cell in each of the `n_rows` rows of all recordings, or a single one for each
-    recording that has the column. It may have at most 12 different words; but their number does not
-    matter if it is named like a status (`Status`, `valid`) and has a text other than those for lost
-    values (`LOST`, like `nan` or `-`). The words must change within a recording, or there must be
-    several words, of which one names a force or a torque. A column that is named like a status may
-    have numbers, and also just one word in all; but if it is named like a verdict (`result`), too,
-    and this word is known to mean good or bad, the result is False, because the column holds
-    labels. Any other column must have texts, or empty cells if it is named like a verdict, and must
-    not be named like a clock (`time`).
+    recording that has the column. It must be a status (`is_status`), or have 1 to 12 different
+    texts, perhaps beside numbers, like `Max` in a footer, and no times. The words must change
+    within a recording, or there must be several words, of which one names a force or a torque; or a
+    column that is named like a status (`Status`, `valid`) has just one word in all.
     """
     words = column.counts
-    is_named = QUALIFIER_NAME.search(column.name) is not None
-    is_verdict = NAME.fullmatch(column.name)
-    has_words = any(column.odd) or (is_verdict and column.odd)  # or beside empty cells, a number
-    is_coded = is_named and {word.lower() for word in column.odd}.difference(LOST)
-    is_full = words.total() in (n_rows, len(column.fixed))  # a cell for each row, or recording
-    if not words or not is_full or (len(words) > MOST_WORDS and not is_coded):
-        return False
-    if not is_named and (not has_words or CLOCK_NAME.search(column.name)):
+    is_text = 0 < len(texts_of(column)) <= MOST_WORDS
+    is_time = column.forms or CLOCK_NAME.search(column.name)
+    if words.total() not in (n_rows, len(column.fixed)):
         return False
     if not column.fixed:
-        return True
+        return is_status(column) or (is_text and not is_time)
     if len(words) > 1:
         return any(map(SIGNAL.fullmatch, words))
-    return is_named and not (is_verdict and has_meaning(LabelSource(column=column.name), words))
+    return QUALIFIER_NAME.search(column.name) is not None
 
 
 def sources_named(p: Proposal, column: re.Pattern[str], line: re.Pattern[str]) -> list[PartSource]:
@@ -305,8 +316,8 @@ def may_be_channel(column: Column) -> bool:
     It must have at least three different numbers, change within a recording, and be no times and
     not named like a counter of rows.
     """
-    is_other = is_clock(column) or COUNTER_NAME.fullmatch(column.name) or column.fixed
-    return not is_other and len(column.counts) - len(column.odd) > 2
+    is_other = is_clock(column) or COUNTER_NAME.fullmatch(column.name) or is_status(column)
+    return not (is_other or column.fixed) and len(column.counts) - len(column.odd) > 2
 
 
 def find_lost(p: Proposal) -> None:
@@ -318,22 +329,10 @@ def find_lost(p: Proposal) -> None:
     `text.missing` is `?`, with a note. If more than 10 % of the cells of a channel are empty, "" is
     not added for it if `time.column` is set, even to `?`: these rows belong to another signal.
     `[rows]`, the section on which rows are samples, then drops them, unless it has words of this
-    channel already. `[rows]` also gets each column without a role (like clock or channel) that
-    changes within a recording and has numbers and, in up to 10 % of its cells, other words, not all
-    in `LOST`, like `Max` in a footer; its `keep` is `?`, with a note. Dropped rows are left out of
-    `p.tables` and `p.columns`, but none while a `keep` is `?` (see `set_rows`). A stated
-    `text.missing` stays, but `[rows]` changes all the same. Raises SettingError for a malformed
-    `windows.trigger`.
+    channel already, and they are left out of `p.tables` and `p.columns`, but none while a `keep` is
+    `?` (see `set_rows`). A stated `text.missing` stays, but `[rows]` changes all the same.
     """
     rows = dict(p.description.rows)
-    for column in p.unused:
-        words = {word: n for word, n in column.odd.items() if word.lower() not in LOST}
-        most = SPARSE * column.counts.total()
-        if words and not column.fixed and sum(column.odd.values()) <= most:
-            rows[column.name] = RowWords((UNKNOWN,))
-            p.notes[f"rows.{column.name}.keep"] = (
-                f"numbers, and {counts_of(words)}: state which to drop, or keep=* if none"
-            )
     missing = {*p.description.text.missing}
     strange = dict[str, int]()
     for name in p.description.channels:
