@@ -20,11 +20,11 @@ from ..table import Table
 from .columns import MOST_WORDS, Proposal, Tables, counts_of
 
 GOOD = (
-    "ok", "pass", "passed", "good", "success", "gut", "true", "i.o.", "i.o", "i_o", "io",
+    "ok", "pass", "passed", "good", "success", "gut", "i.o.", "i.o", "i_o", "io",
     "accepted", "合格",
 )  # fmt: skip
 BAD = (
-    "nok", "not ok", "not_ok", "not-ok", "fail", "failed", "bad", "failure", "schlecht", "false",
+    "nok", "not ok", "not_ok", "not-ok", "fail", "failed", "bad", "failure", "schlecht",
     "n.i.o.", "n.i.o", "n_i_o", "n-io", "n_io", "nio", "ng", "reject", "rejected", "不合格",
 )  # fmt: skip
 UNCHECKED = ("", "-", "--", "pending", "open", "offen", "unchecked", "not checked", "n/a")
@@ -37,7 +37,7 @@ VERDICT = (
 WHOLE = "(total|overall|final|part|teil|gesamt)"
 NAME = re.compile(rf"(?i)(({WHOLE}|test|{VERDICT})[-_ ./]?)?{VERDICT}([-_ .]?{WHOLE})?")
 GOOD_NAME = re.compile(r"(?i)(.*[./])?(success|ok|io|pass(ed)?|accept(ed)?|good)")
-IN_PATHS = (*GOOD, *BAD, "pending", "offen", "unchecked")
+IN_PATHS = (*GOOD, *BAD, "true", "false", "pending", "offen", "unchecked")
 WORD = "|".join(sorted(map(re.escape, IN_PATHS), key=len, reverse=True))
 NEGATED = re.compile(  # or of a name that may be bad, as in `leak=False`
     rf"(?i)(not.(?!ok)|(?<![a-z])(nicht|non|kein|pas|hors)([-_ .][^-_ ./]+)?[-_ .]|nicht."
@@ -73,20 +73,16 @@ def with_meanings(source: LabelSource, words: Names) -> LabelSource:
 
     A list that the source has already stays; the others get the words of known meaning, like "ok",
     in any case of letters. Then `good` or `bad` becomes `?` if it would be empty: that all files
-    say `OK` proves nothing. True, yes or 1 and their opposites, alone or with words for unchecked
-    (not labelled yet), have known meanings only if the name of the column, line or topic (a named
-    series of messages in a ROS bag) is one for good, like `success`, not `failed`; in a path whose
-    expression has `([^`, as in `([^/]+)/`, they have none. Beside other words, and in every other
-    path, true means good and false bad, whatever the name is; yes, 1 and their opposites have no
-    known meaning there.
+    say `OK` proves nothing. True, yes and 1 mean good, and their opposites bad, if the name of the
+    column, line or topic (a named series of messages in a ROS bag) is one for good, like `success`,
+    or in a path whose expression lists its words, like `(False|True)`; elsewhere they have no known
+    meaning.
     """
     words = sorted({*words})
-    name = (
-        source.column or source.line or source.topic or ("" if lists_words(source) else source.path)
-    )
+    name = source.column or source.line or source.topic
     groups: Sequence[Sequence[str]] = (GOOD, BAD, UNCHECKED)
-    if name and {word.lower() for word in words} <= {*YES, *NO, *UNCHECKED}:
-        groups = (YES, NO, UNCHECKED) if GOOD_NAME.fullmatch(name) else ((), (), UNCHECKED)
+    if lists_words(source) or GOOD_NAME.fullmatch(name):
+        groups = ((*GOOD, *YES), (*BAD, *NO), UNCHECKED)
     goods, bads, others = (tuple(w for w in words if w.lower() in group) for group in groups)
     return replace(
         source,

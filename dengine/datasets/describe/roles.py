@@ -28,10 +28,10 @@ from .columns import FORCES, LOST, MOST_WORDS, Column, Proposal, columns_of, cou
 from .labels import NAME, lines_of, part_words, propose_label
 from .layout import PART_NAME
 from .order import propose_order
+from .text_form import is_numbering
 
 SPARSE = 0.1
 STRANGE = 0.01
-MOST_STEP = 1.5  # from one number of a column like `x0`, `x1` to the next, in usual steps
 PART_LINE = re.compile(
     r"(?i)^sn$|specimen|serial|(?<!fixture )barcode|dmc|part ?(no|num|id)|teilenummer|serien"
     r"|werkst.ck(?!tr)"
@@ -280,17 +280,16 @@ def _doubt_on(p: Proposal, name: str) -> str:
 
     The reasons: the column is named like a value that a controller aims at or like a limit
     (`F_soll`, `set_force`, `F_max`); `name` is like `x*` and stands for the columns `x0`, `x1`, ...
-    of the first of `p.tables`, and a step from the number in one of these names to that in the next
-    is longer than 1.5 times the median step. `p` is the description so far, and `p.tables` are the
-    recordings that are looked at.
+    of the first of `p.tables`, and these numbers do not rise evenly (`is_numbering`). `p` is the
+    description so far, and `p.tables` are the recordings that are looked at.
     """
     if SET_VALUE.search(name):
         return f"{name} may be a set value"
-    columns = match_numbered(name, p.tables[0].origin.get(name, ()) if p.tables else ())
-    steps = np.diff([float(match[1]) for match in columns])
-    if not len(steps) or steps.max() <= np.median(steps) * MOST_STEP:
+    names = p.tables[0].origin.get(name, ()) if p.tables else ()
+    numbers = [match[1] for match in match_numbered(name, names)]
+    if not numbers or is_numbering(numbers):
         return ""
-    return f"{name} is not numbered evenly at {columns[steps.argmax() + 1][0]}"
+    return f"{name} is not numbered evenly"
 
 
 def _other_scales(p: Proposal) -> Iterator[str]:

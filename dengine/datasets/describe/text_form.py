@@ -24,7 +24,7 @@ from ..read.text import BLANK, COMMENT, LATIN, header_names, split_line, to_utf8
 from ..table import pattern_of
 from ..units import is_unit
 from .clock import EVEN
-from .columns import LEAST_RUN, MOST_WORDS, NUMBER, Proposal, most_frequent
+from .columns import MOST_WORDS, NUMBER, Proposal, most_frequent
 
 DELIMITERS = ";\t|, "
 BLANKS_LEAD = 1.15  # by which blanks must be the better delimiter, since cells may hold some
@@ -225,8 +225,8 @@ def propose_form(p: Proposal, contents: Mapping[str, bytes], faults: Faults) -> 
 
     `p` is the description so far, and `[text]` its section on how text files are written. Files
     with another delimiter, number of columns or header are left out: they move from `p.names` to
-    `p.others`. If two or more of them have at least 8 rows of samples, or if a single one has, and
-    its name differs by a number only from that of a file in the result, `exclude` (the patterns of
+    `p.others`. If there are two or more of them, or the name of a single one differs by a number
+    only from that of a file in the result, `exclude` (the patterns of
     files that are no recordings) is set to `?` (the user must answer), with a note that asks
     whether they are recordings. For a file that is no text, or whose header is not certain, a fault
     (why it cannot be read) is appended to `faults`, and it stays in `p.names`; if all are such,
@@ -246,9 +246,8 @@ def propose_form(p: Proposal, contents: Mapping[str, bytes], faults: Faults) -> 
     same = [name for name, form in forms.items() if form == usual]
     odd = [name for name, form in forms.items() if form != usual]
     p.set_aside(odd)
-    long = [name for name in odd if len(looks[name].rows) >= LEAST_RUN]
-    alike = {DIGITS.sub("0", name) for name in long} & {DIGITS.sub("0", name) for name in same}
-    if len(long) > 1 or alike:
+    alike = {DIGITS.sub("0", name) for name in odd} & {DIGITS.sub("0", name) for name in same}
+    if len(odd) > 1 or alike:
         p.put("exclude", UNKNOWN, f"are {listed(odd)} recordings of another form? See files")
     if same:
         _propose_keys(p, [looks[name] for name in same])
