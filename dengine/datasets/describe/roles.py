@@ -14,7 +14,6 @@ from ..description import (
     ANY,
     UNKNOWN,
     PartSource,
-    RowMeanings,
     RowWords,
     expect_one_of,
 )
@@ -67,7 +66,7 @@ def propose_roles(p: Proposal) -> None:
     and if its column is `?`, `order` stays as it is. `ignored` becomes the columns without any use,
     with their units. `exclude` becomes the files in `p.others` without listings of labels, if there
     are any, unless `exclude` is `?`. Stated keys stay, but a stated `ignored` is replaced, and a
-    stated `[rows]` gets further words and columns (`complete_rows`, `find_lost`, `qualify_rows`).
+    stated `[rows]` gets further words and columns (`complete_rows`, `qualify_rows`).
     `p.columns` is set, and `p.tables` loses rows that are no samples. Raises DataError if a stated
     column of times or channel does not exist, a setting in `[time]` is wrong, a stated source of
     labels has no words (like `ok`) or cannot be read, or cells are lists, and SettingError for a
@@ -100,32 +99,14 @@ def propose_roles(p: Proposal) -> None:
     p.put("ignored", {column.name: column.unit for column in p.unused})
 
 
-def set_rows(p: Proposal, rows: RowMeanings) -> None:
-    """Set `[rows]` in `p`, and leave the rows that are no samples out of its tables and columns.
-
-    `p`, the proposal, holds the description so far and the recordings that it is inferred from.
-    `rows` has, by column, the words that keep a row (`keep`; `?` while that is open), drop it, or
-    mark its samples as lost. A recording keeps all rows if it lacks a column of `rows`, or has a
-    word without a meaning there; all of them do while a `keep` is `?`. But a recording with one
-    cell in such a column is left out as a whole if the word of this cell drops it; if that leaves
-    out all recordings, all of them stay, with all rows. Nothing changes if `rows` is empty.
-    """
-    if rows:
-        p.description = replace(p.description, rows=rows)
-        tables = [table for table in p.tables if not is_dropped(table, rows)]
-        for i, table in enumerate(tables):
-            with suppress(DataError):
-                tables[i] = kept_rows(table, rows)
-        p.tables = tables or p.tables
-        p.columns = columns_of(p.tables, p.description.text)
-
-
 def complete_rows(p: Proposal) -> None:
     """Add the words that the user did not state to the stated `[rows]` in `p`, and apply it.
 
     The other words of a column are added to `keep`, or to `drop` if `keep` is stated; `*` in their
     place if they are more than 12, and nothing if `*` is stated. Rows that are no samples are left
-    out of `p.tables` and `p.columns` (see `set_rows`).
+    out of `p.tables` and `p.columns`; a recording keeps all rows if it lacks a column of `[rows]`.
+    But a recording with one cell in such a column is left out as a whole if the word of this cell
+    drops it; if that leaves out all recordings, all of them stay.
     """
     rows = dict(p.description.rows)
     for name in rows.keys() & p.columns.keys():
@@ -136,7 +117,13 @@ def complete_rows(p: Proposal) -> None:
         if ANY not in named:
             key = "drop" if about.keep else "keep"
             rows[name] = replace(about, **{key: getattr(about, key) + words})
-    set_rows(p, rows)
+    p.description = replace(p.description, rows=rows)
+    tables = [table for table in p.tables if not is_dropped(table, rows)]
+    for i, table in enumerate(tables):
+        with suppress(DataError):
+            tables[i] = kept_rows(table, rows)
+    p.tables = tables or p.tables
+    p.columns = columns_of(p.tables, p.description.text)
 
 
 def qualify_rows(p: Proposal) -> None:
@@ -325,35 +312,31 @@ def find_lost(p: Proposal) -> None:
     `p` is the description so far. The words are those already there, and those of `LOST`, like
     `nan`, `-` or the empty cell, that a channel has, in any case of letters. If another text is in
     more than 1 % of a channel's cells, or if one of them has a number like -9999 in a text file,
-    `text.missing` is `?`, with a note. If more than 10 % of the cells of a channel are empty, "" is
-    not added for it if `time.column` is set, even to `?`: these rows belong to another signal.
-    `[rows]`, the section on which rows are samples, then drops them, unless it has words of this
-    channel already, and they are left out of `p.tables` and `p.columns`, but none while a `keep` is
-    `?` (see `set_rows`). A stated `text.missing` stays, but `[rows]` changes all the same.
+    `text.missing` is `?`, with a note. So it is if more than 10 % of the cells of a channel are
+    empty and `time.column` is set, even to `?`: these rows may belong to another signal. A stated
+    `text.missing` stays.
     """
-    rows = dict(p.description.rows)
     missing = {*p.description.text.missing}
     strange = dict[str, int]()
     for name in p.description.channels:
         column = p.columns[name]
         n_cells = column.counts.total()
         for word, n in column.odd.items():
-            if not word and p.description.time.column and n > SPARSE * n_cells:
-                rows.setdefault(name, RowWords((ANY,), ("",)))
-            elif word.lower() in LOST:
+            is_sparse = not word and p.description.time.column and n > SPARSE * n_cells
+            if word.lower() in LOST and not is_sparse:
                 missing.add(word)
             elif n > STRANGE * n_cells and word not in missing:
                 strange[word] = n
         if p.description.format == "text":
             strange |= {word: n for word, n in column.counts.items() if SENTINEL.fullmatch(word)}
-    set_rows(p, rows)
     p.put("text.missing", sorted(missing))
     if strange:
         p.put(
             "text.missing",
             UNKNOWN,
             f"do these mean a lost sample? {counts_of(strange)}; if so state "
-            f"{[*sorted(missing), *strange]}",
+            f"{[*sorted(missing), *strange]}; rows of another signal: rows.COLUMN.drop, and "
+            "channels.COLUMN",
         )
 
 

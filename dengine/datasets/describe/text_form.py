@@ -20,7 +20,7 @@ from ...errors import DataError, listed
 from ..dataset import Faults
 from ..description import UNKNOWN, Stated, Strings, TextForm
 from ..read.files import caught
-from ..read.text import BLANK, COMMENT, LATIN, header_names, split_line, to_utf8, to_utf8_or_latin
+from ..read.text import BLANK, COMMENT, LATIN, split_line, to_utf8, to_utf8_or_latin
 from ..table import pattern_of
 from ..units import is_unit
 from .clock import EVEN
@@ -49,13 +49,11 @@ Rows = Sequence[Strings]
 class Look(NamedTuple):
     """The first lines of a file.
 
-    form : of the file. width : cells of a row. is_closed : whether a delimiter ends each row.
-    line : the header. rows : the cells of the samples.
+    form : of the file. width : cells of a row. line : the header. rows : the cells of the samples.
     """
 
     form: TextForm
     width: int
-    is_closed: bool
     line: str
     rows: Rows
 
@@ -65,15 +63,14 @@ def look(content: bytes, stated: Stated) -> Look:
 
     Only its first 2 million characters are looked at. The result has the text form (encoding,
     delimiter, lines of the header, of the units and of the first samples), the number of cells in a
-    row, whether a delimiter ends each row (its last cell is then empty), the line of the header (""
-    for none) and the cells of each line from the first row of samples on, also of lines of another
-    form. The delimiter, which is the one that best splits the lines into numbers, and the first row
-    follow from the first 200 lines; of equally good delimiters the one with more cells is taken. If
-    none splits the usual line into cells, there is a single column, and the delimiter is a
-    semicolon, or the stated one. The decimal mark and the mark of thousands are not looked for: the
-    text form has the defaults. `content` has the bytes of the file. Raises DataError if it is empty
-    or no text, or if the line of its header is not certain, and LookupError for a stated encoding
-    that Python does not know.
+    row, the line of the header ("" for none) and the cells of each line from the first row of
+    samples on, also of lines of another form. The delimiter, which is the one that best splits the
+    lines into numbers, and the first row follow from the first 200 lines; of equally good
+    delimiters the one with more cells is taken. If none splits the usual line into cells, there is
+    a single column, and the delimiter is a semicolon, or the stated one. The decimal mark and the
+    mark of thousands are not looked for: the text form has the defaults. `content` has the bytes of
+    the file. Raises DataError if it is empty or no text, or if the line of its header is not
+    certain, and LookupError for a stated encoding that Python does not know.
 
     stated : keys that the user gave. `text.encoding` and `text.delimiter` are taken, and so is
     `text.header` if it is a text, with which the header begins, unless no line above the samples
@@ -95,7 +92,7 @@ def look(content: bytes, stated: Stated) -> Look:
         found = (i for i, line in enumerate(lines[:data], 1) if line.startswith(beginning))
         header = next(found, header)
     form = TextForm(encoding, delimiter, header=header, units=units, data=data + 1)
-    return Look(form, width, is_closed, "".join(lines[header - 1 : header]), rows[data:])
+    return Look(form, width, "".join(lines[header - 1 : header]), rows[data:])
 
 
 def decode(content: bytes, stated: str) -> tuple[str, str]:
@@ -286,13 +283,10 @@ def _propose_keys(p: Proposal, looks: Sequence[Look]) -> None:
 def _column_names(usual: Look) -> Strings:
     """Return the names of columns for `text.names`; empty if the header names each column.
 
-    `#` or `%` at the beginning of the header is skipped. If the header has more cells than there
-    are columns, the first are the names; but if the delimiter is a blank, only if the others are
-    empty. If it lacks the last column, and this is empty in all rows, the names are those of the
-    header and one like `column3`. Without a header, or if it has another number of cells, the names
-    are `c0`, `c1`, ...; for 20 columns or more it is `x*`, which names all of them. Such a table
-    may have a part in each row: if its first column has 2 to 12 different words, all whole numbers,
-    it is named `class`, before `x*`.
+    `#` or `%` at the beginning of the header is skipped. Without a header, or if it has another
+    number of cells than there are columns, the names are `c0`, `c1`, ...; for 20 columns or more it
+    is `x*`, which names all of them. Such a table may have a part in each row: if its first column
+    has 2 to 12 different words, all whole numbers, it is named `class`, before `x*`.
 
     usual : how a typical file is written, and the cells of its samples.
     """
@@ -300,9 +294,6 @@ def _column_names(usual: Look) -> Strings:
     cells = split_line(COMMENT.sub("", usual.line.lstrip()), usual.form.delimiter)
     if len(cells) == width:
         return []
-    is_blank = usual.form.delimiter == BLANK  # in names may be blanks
-    if len(cells) >= width - usual.is_closed and not (is_blank and any(cells[width:])):
-        return header_names([*cells, ""])[:width]
     if width < MOST_NAMES:
         return [f"c{i}" for i in range(width)]
     firsts = {row[0] for row in usual.rows if row}
