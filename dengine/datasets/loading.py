@@ -205,22 +205,18 @@ def own_reader(source: Any) -> Callable[[], Dataset] | None:
         source = Path(str(files("dengine"))) / "data" / name
     path = as_source(source)
     if path.is_file() and not saved_description(path).is_file():
-        for is_own, read in OWN_FILES:
-            with instead(DataError, f"Cannot read {path}", OSError):
-                if is_own(path):
-                    return partial(read, path)
+        is_own, read = OWN_FILES.get(path.suffix.lower(), (is_database, _read_store))
+        with instead(DataError, f"Cannot read {path}", OSError):
+            return partial(read, path) if is_own(path) else None
     return None
 
 
 def _is_own_archive(path: Path) -> bool:
     """Return whether a file is an .npz archive with an array X, and numbers y that are all 1 or 0.
 
-    A file of another suffix is not opened. Raises DataError for an .npz file that is damaged or
-    cannot be opened, or whose y holds Python objects or needs too much memory (`read_archive`); of
-    its arrays only y is read.
+    Raises DataError for an .npz file that is damaged or cannot be opened, or whose y holds Python
+    objects or needs too much memory (`read_archive`); of its arrays only y is read.
     """
-    if path.suffix.lower() != ".npz":
-        return False
     arrays, names = read_archive(path, ("y",))
     labels = arrays.get("y", np.array("none"))
     return "X" in names and labels.dtype.kind in "iufb" and bool(np.isin(labels, (0, 1)).all())
@@ -229,11 +225,9 @@ def _is_own_archive(path: Path) -> bool:
 def _is_own_table(path: Path) -> bool:
     """Return whether a file is a Parquet file of a table that `Dataset.to_frame` made.
 
-    A file of another suffix is not opened. Raises DataError if a .parquet file is damaged or cannot
-    be opened, or if pyarrow is not installed.
+    Raises DataError if a .parquet file is damaged or cannot be opened, or if pyarrow is not
+    installed.
     """
-    if path.suffix.lower() != ".parquet":
-        return False
     with read_errors(path, "a Parquet file", "pyarrow", "files"):
         from pyarrow.parquet import read_schema
 
@@ -338,8 +332,8 @@ def _read_store(path: Path) -> Dataset:
     )
 
 
-OWN_FILES = (
-    (is_database, _read_store),
-    (_is_own_archive, _read_npz),
-    (_is_own_table, _read_own_table),
-)
+# By suffix: how files of our own are known, and read. Any other one may be a store.
+OWN_FILES: dict[str, tuple[Callable[[Path], bool], Callable[[Path], Dataset]]] = {
+    ".npz": (_is_own_archive, _read_npz),
+    ".parquet": (_is_own_table, _read_own_table),
+}

@@ -39,11 +39,8 @@ NAMED_UNIT = re.compile(
 EPOCHS = (
     *((unit, 0) for unit in ("s", "ms", "us", "ns")),
     ("d", 2_209_161_600),  # since 1900, as spreadsheets count days
-    ("d", 62_167_305_600),  # since the year 0, as MATLAB counts them
-    ("0.0864 s", 2_209_161_600),  # 1e-6 days since 1900, as WinCC counts them
-    ("0.1 us", 11_644_473_600),  # since 1601
-    ("0.1 us", 62_135_596_800),  # since the year 1
 )
+GUESSES = ("s", "ms", "us", "ns", "min", "d", "0.1 us")  # of a unit that nothing states
 YEARS = (946_684_800, 2_524_608_000)  # seconds since 1970 of the years 2000 to 2050
 # Steps between these are taken for seconds: larger ones may be milliseconds of a rate up to 50 kHz,
 # and smaller ones minutes.
@@ -204,7 +201,7 @@ def _unit_by_size(column: Column, p: Proposal) -> str:
     if SECONDS[0] <= step <= SECONDS[1]:
         p.notes["time.format"] = f"seconds, for steps of {step:.6g}; the unit is not stated"
         return "s"
-    rates = [f"{unit} ({1 / step / UNITS[unit]:.6g} Hz)" for unit in ("s", "ms", "us", "ns", "min")]
+    rates = [f"{unit} ({1 / step / scale_of(unit):.6g} Hz)" for unit in GUESSES]
     p.notes["time.format"] = f"steps of {step:.6g}, the unit is not stated: {', '.join(rates)}"
     return UNKNOWN
 
@@ -219,18 +216,18 @@ def propose_rate(p: Proposal, tables: Tables) -> None:
 
     `p` is the description so far; stated keys stay. `tables` has the samples of each recording.
     With `time.sort` the times of each are sorted first. Steps below 0 are left out of the mean, and
-    the rate is rounded to five digits. It is `?` (the user must answer), with a note, if it is not
-    between 1 Hz and 1 MHz, like that of times that only fall; then `time.gap`, the longest step
-    that is allowed, is not looked at. Otherwise `check_steps` checks the times, by the rate and the
-    gap that the description has by then. If it refuses more recordings than 10 % plus one,
-    `time.gap` is set to `?`, with a note on the first. If recordings of another length are stated
-    to be resampled (`traces.lengths`), `traces.samples` becomes the number of samples for which
-    99 % of the recordings last; longer ones lose their end when they are read. `order` is set to
-    `time` if all recordings start after 1999 (UTC), also if the rate is `?`. If they do not, but no
-    two of them overlap in time, so that one clock runs on through all, and they do not stand in the
-    order of their times, `order` is `?`. Recordings whose times cannot be read are skipped. Raises
-    DataError if a stated format is no form or unit of times, or if a setting in `[time]` is wrong
-    (see `check_forms`).
+    the rate is rounded to five digits. It is
+    `?` (the user must answer), with a note, if it is not between 1 Hz and 1 MHz, like that of times
+    that only fall; then `time.gap`, the longest step that is allowed, is not looked at. Otherwise
+    `check_steps` checks the times, by the rate and the gap that the description has by then. If it
+    refuses more recordings than 10 % plus one, `time.gap` is set to `?`, with a note on the first.
+    If recordings of another length are stated to be resampled (`traces.lengths`), `traces.samples`
+    becomes the number of samples for which 99 % of the recordings last; longer ones lose their end
+    when they are read. `order` is set to `time` if all recordings start after 1999 (UTC), also if
+    the rate is `?`. If they do not, but no two of them overlap in time, so that one clock runs on
+    through all, and they do not stand in the order of their times, `order` is `?`. Recordings whose
+    times cannot be read are skipped. Raises DataError if a stated format is no form or unit of
+    times, or if a setting in `[time]` is wrong (see `check_forms`).
     """
     clock = p.description.time
     check_forms(clock, TextForm())  # the marks in numbers may be ? by now

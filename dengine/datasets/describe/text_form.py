@@ -174,14 +174,12 @@ def _head_lines(rows: Rows, width: int, stated: Stated) -> tuple[int, int]:
     """Return the lines, from 1, of the header and of the units above the samples; 0 for none.
 
     A candidate for either is a line of at least `width` cells, the number of columns, of which one
-    is neither empty nor a row of dashes. First a pair is looked for, from below: a candidate with
-    nothing but units is the line of the units, and a candidate right above it, of whose cells at
-    most half are units, the header; all lines from there to the last candidate must be candidates.
-    If there is no such pair, the header is the last candidate; but if more than half of its cells
-    are units, and there is an earlier candidate, it is the line of the units, and the earlier one
-    the header. Raises DataError if a header of this second rule has a unit, or a name twice, and
-    the candidate before it has no empty cell, so that either may be the header; but not if
-    `stated`, the keys that the user gave, has `text.header` (its value is not used here).
+    is neither empty nor a row of dashes. The header is the last candidate; but if more than half of
+    its cells are units, and there is an earlier candidate, it is the line of the units, and the one
+    before it the header. Raises DataError if either of two candidates may be the header: if the
+    first has nothing but units; or if the last has a unit, or a name twice, and the one before no
+    empty cell. But not if `stated`, the keys that the user gave, has `text.header` (its value is
+    not used here).
 
     rows : the cells of the lines above the samples.
     """
@@ -190,25 +188,21 @@ def _head_lines(rows: Rows, width: int, stated: Stated) -> tuple[int, int]:
         for i, row in enumerate(rows, 1)
         if len(row) >= width and not all(map(RULE.fullmatch, row))
     ]
-    shares = {i: _share_of_units(rows[i - 1]) for i in heads}
-    for i in reversed(heads):
-        if shares[i] == 1 and shares.get(i - 1, 1) <= HALF:
-            return i - 1, i
-        if i - 1 not in heads:
-            break
-    units = 0
-    for i in heads[:0:-1]:
-        if shares[i] <= HALF or units:
-            names = [*filter(None, rows[i - 1])]
-            is_odd = shares[i] or len({*names}) < len(names)
-            if is_odd and all(rows[heads[-2] - 1]) and "text.header" not in stated:
-                raise DataError(
-                    f"Expected one line of names, lines {heads[-2]} and {i} may be; state "
-                    "text.header."
-                )
-            break
-        units = heads.pop()
-    return max(heads, default=0), units
+    header, units = max(heads, default=0), 0
+    if len(heads) > 1:
+        above, names = (rows[i - 1] for i in heads[-2:])
+        names = [*filter(None, names)]
+        is_odd = _share_of_units(names) or len({*names}) < len(names)
+        if _share_of_units(names) > HALF:
+            header, units = heads[-2:]
+        elif "text.header" not in stated and (
+            _share_of_units(above) == 1 or (is_odd and all(above))
+        ):
+            raise DataError(
+                f"Expected one line of names, lines {heads[-2]} and {header} may be; state "
+                "text.header."
+            )
+    return header, units
 
 
 def _share_of_units(row: Strings) -> float:
