@@ -36,10 +36,7 @@ NAMED_UNIT = re.compile(
     r"|(?P<us>micros)|(?P<s>(?:^|[^a-z])secs?(?:onds?)?$)"
 )
 # Counts since some day: their unit, and the seconds from that day to 1970.
-EPOCHS = (
-    *((unit, 0) for unit in ("s", "ms", "us", "ns")),
-    ("d", 2_209_161_600),  # since 1900, as spreadsheets count days
-)
+EPOCHS = {"s": 0, "ms": 0, "us": 0, "ns": 0, "d": 2_209_161_600}  # days since 1900: spreadsheets
 GUESSES = ("s", "ms", "us", "ns", "min", "d", "0.1 us")  # of a unit that nothing states
 YEARS = (946_684_800, 2_524_608_000)  # seconds since 1970 of the years 2000 to 2050
 # Steps between these are taken for seconds: larger ones may be milliseconds of a rate up to 50 kHz,
@@ -145,7 +142,7 @@ def epoch_of(column: Column) -> str:
     to 1 MHz. Of several such units the first in `EPOCHS`, the list of those that are tried, is
     returned.
     """
-    for unit, zero in EPOCHS:
+    for unit, zero in EPOCHS.items():
         scale = scale_of(unit)
         if is_rate(column.usual_step * scale):
             moment = np.concatenate(column.numbers)[0] * scale - zero

@@ -111,12 +111,12 @@ def complete_rows(p: Proposal) -> None:
     rows = dict(p.description.rows)
     for name in rows.keys() & p.columns.keys():
         about = rows[name]
-        named = {*about.keep, *about.drop, *about.invalid}
-        rest = tuple(sorted(p.columns[name].counts.keys() - named))
-        words = rest if len(rest) <= MOST_WORDS else (ANY,)
-        if ANY not in named:
-            key = "drop" if about.keep else "keep"
-            rows[name] = replace(about, **{key: getattr(about, key) + words})
+        words = [*p.columns[name].counts]
+        others = tuple(word for word in sorted(words) if about.kinds([word]) == [""])
+        if len(others) > MOST_WORDS:
+            others = (ANY,)
+        key = "drop" if about.keep else "keep"
+        rows[name] = replace(about, **{key: getattr(about, key) + others})
     p.description = replace(p.description, rows=rows)
     tables = [table for table in p.tables if not is_dropped(table, rows)]
     for i, table in enumerate(tables):
@@ -352,22 +352,22 @@ def propose_lengths(p: Proposal) -> None:
     stated, another note counts the recordings that end with two zeros or NaN or more, if they are
     more than 10 %: these may fill up shorter recordings.
     """
-    if p.description.channels:
-        column = p.columns[next(iter(p.description.channels))]
-        lengths = [len(words) for words in column.words if len(words)]
-        usual = int(np.median(lengths or 0))
-        others = [n for n in lengths if n != usual]
-        if others:
-            text = (
-                f"{len(others)} of {len(lengths)} recordings have another length, {min(others)} to "
-                f"{max(others)}; other choices: cut, pad-all, resample, strict"
-            )
-            is_few = len(others) <= SPARSE * len(lengths)
-            p.put("traces.lengths", "strict" if is_few else "pad", text)
-        n_filled = sum(np.array_equal(np.nan_to_num(x[-2:]), [0, 0]) for x in column.numbers)
-        note = f"{n_filled} recordings end with several zeros or NaN: are these samples?"
-        p.put(
-            "traces.samples",
-            p.description.traces.samples or usual,
-            note if n_filled > SPARSE * len(lengths) else "",
+    if not p.description.channels:
+        return
+    column = p.columns[next(iter(p.description.channels))]
+    lengths = [len(words) for words in column.words if len(words)]
+    usual = int(np.median(lengths or 0))
+    others = [n for n in lengths if n != usual]
+    most = SPARSE * len(lengths)
+    if others:
+        text = (
+            f"{len(others)} of {len(lengths)} recordings have another length, {min(others)} to "
+            f"{max(others)}; other choices: cut, pad-all, resample, strict"
+        )
+        p.put("traces.lengths", "strict" if len(others) <= most else "pad", text)
+    p.put("traces.samples", p.description.traces.samples or usual)
+    n_filled = sum(np.array_equal(np.nan_to_num(x[-2:]), [0, 0]) for x in column.numbers)
+    if n_filled > most and "traces.samples" not in p.stated:
+        p.notes["traces.samples"] = (
+            f"{n_filled} recordings end with several zeros or NaN: are these samples?"
         )

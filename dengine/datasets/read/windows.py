@@ -26,7 +26,7 @@ def cut(table: Table, description: Description, base: Path) -> Iterator[Table]:
     A part is a window of rows, which a trigger, a condition on a signal, begins, or whose start and
     end are in a listing, a file in the folder `base`; with both stated the trigger counts. A
     trigger's window has `traces.samples` rows, or fewer at the end of the recording, which is no
-    damage. Windows of a listing come by increasing start, and one without samples has one row. The
+    damage. Windows of a listing come by increasing start. The
     `path` of a part's table is the number of the part from 1, or its key in the listing. A part has
     `damage` (an error for which it is left out) if a trigger begins it in a gap of the times, or if
     a window of the listing has no samples, overlaps an earlier one, or goes beyond the recording.
@@ -98,8 +98,8 @@ def _listed(table: Table, times: Floats, description: Description, base: Path) -
     later, like dates, and all ends in the listing are smaller, its times count from the first of
     `times`. The rows are those from the start to before the end (less 1e-5 s, for rounding). A
     window has a fault (why it is left out) if it overlaps an earlier one, has no samples, or goes
-    beyond the recording by more than 1.5 steps of the stated rate (without one: at all); one
-    without samples gets the first row. Raises DataError if the listing or its times cannot be read,
+    beyond the recording by more than 1.5 steps of the stated rate (without one: at all).
+    Raises DataError if the listing or its times cannot be read,
     and LookupError for an encoding that Python does not know.
     """
     about = description.windows
@@ -115,12 +115,12 @@ def _listed(table: Table, times: Floats, description: Description, base: Path) -
     margin = 1.5 / (description.time.rate_hz or np.inf) + TOLERANCE
     least = times[0] - margin
     for begin, end, key in sorted(zip(begins, ends, keys.tolist(), strict=True)):
-        rows = np.flatnonzero((times >= begin) & (times < end))
+        rows = slice(*np.searchsorted(times, (begin, end)))
         fault = ""
-        if not len(rows) or begin < least or end > times[-1] + margin:
+        if rows.start == rows.stop or begin < least or end > times[-1] + margin:
             fault = (
                 "Expected samples in the whole window, it has none, goes beyond the recording or "
                 "overlaps the window before"
             )
         least = max(least, end - TOLERANCE)
-        yield key, slice(rows[0], rows[-1] + 1) if len(rows) else slice(0, 1), fault
+        yield key, rows, fault
