@@ -18,7 +18,7 @@ from ..table import Table, UnreadableError
 from ..units import quantity_of
 from .columns import FORCES, Column, Proposal, Tables
 
-NAME = re.compile(
+CLOCK_NAME = re.compile(
     r"time|zeit|stamp|clock|temps|tiempo|tempo|hora|heure|millis|milli?tm|micros|elapsed|epoch"
     r"|(^|\.)(t|ms|us|ns|sec|secs|seconds|date|datum|uhr|x_value)$|^t[ _/\[(]|tick_?count"
     r"|^tm$|(^|[._ ])([mun]sec|tick|(\w+_)?ts)s?($|[._ ])"
@@ -70,11 +70,13 @@ def propose_clock(p: Proposal) -> None:
     if is_stated := "time.column" in p.stated:
         clocks = [p.columns[name] for name in p.description.time.column]
     has_days = any(has_day(form) for column in clocks for form in column.forms)
-    coarse = [c for c in p.unused if c.forms or (NAME.search(c.name) and len({*c.fixed}) > 1)]
+    coarse = [c for c in p.unused if c.forms or (CLOCK_NAME.search(c.name) and len({*c.fixed}) > 1)]
     names = [c.name for c in p.unused if c in clocks or (c in coarse and not has_days)]
     if not clocks:
         names = [
-            c.name for c in p.unused if is_counter(c) or (NAME.search(c.name) and c.usual_step)
+            c.name
+            for c in p.unused
+            if is_counter(c) or (CLOCK_NAME.search(c.name) and c.usual_step)
         ]
         unused = [c.name for c in p.unused]
         if "c0" in p.description.text.names or "s" in unused:  # no names; s may be the stroke
@@ -101,7 +103,7 @@ def is_clock(column: Column) -> bool:
     like a counter that begins again, or in at least 90 %, if the newest row is the first. Raises
     UnreadableError if cells are lists.
     """
-    is_named = NAME.search(column.name)
+    is_named = CLOCK_NAME.search(column.name)
     if column.forms or (is_named and column.odd):
         return not column.fixed
     if not is_named or quantity_of(column.unit) or not column.usual_step:

@@ -35,7 +35,7 @@ VERDICT = (
     r"|pass(ed)?|class|target|y|status|urteil|accept(ed)?|judg?e?ment)"
 )
 WHOLE = "(total|overall|final|part|teil|gesamt)"
-NAME = re.compile(rf"(?i)(({WHOLE}|test|{VERDICT})[-_ ./]?)?{VERDICT}([-_ .]?{WHOLE})?")
+VERDICT_NAME = re.compile(rf"(?i)(({WHOLE}|test|{VERDICT})[-_ ./]?)?{VERDICT}([-_ .]?{WHOLE})?")
 GOOD_NAME = re.compile(r"(?i)(.*[./])?(success|ok|io|pass(ed)?|accept(ed)?|good)")
 IN_PATHS = (*GOOD, *BAD, "true", "false", "pending", "offen", "unchecked")
 WORD = "|".join(sorted(map(re.escape, IN_PATHS), key=len, reverse=True))
@@ -128,7 +128,7 @@ def is_named_like_verdict(source: LabelSource) -> bool:
     line and path counts.
     """
     name = source.column or source.line
-    is_named = not name or NAME.fullmatch(name) is not None
+    is_named = not name or VERDICT_NAME.fullmatch(name) is not None
     return is_named and (not source.path or lists_words(source))
 
 

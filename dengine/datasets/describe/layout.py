@@ -8,8 +8,7 @@ from ...errors import DataError, listed
 from ..description import ANY, UNKNOWN, Channel, TextForm
 from ..read.split import OBJECTS, longest_list, split
 from ..table import Table
-from .clock import NAME as CLOCK_NAME
-from .clock import are_even
+from .clock import CLOCK_NAME, are_even
 from .columns import LEAST_RUN, Column, Proposal, Tables, columns_of
 
 PART_NAME = re.compile(

@@ -38,29 +38,32 @@ def propose_order(p: Proposal) -> None:
     this proves the order (`proves_order`), it is `name` if file names give the same order, else
     `path`; if not, it is `?`, with a note. While `label.column` is `?`, paths are not looked at.
 
-    In this order parts are then compared. `order` is also `?` if part numbers, dates, times or
-    counters of the recordings have another order (`unsorted_places`); of several such places the
-    note is on the last. An `order` that the user stated stays. Raises SettingError for a malformed
-    `windows.trigger`, the condition at which long recordings are cut.
+    In this order, or by name if it is not proved, parts are then compared. `order` is also `?` if
+    part numbers, dates, times or counters of the recordings have another order (`unsorted_places`);
+    of several such places the note is on the last. An `order` that the user stated stays. Raises
+    SettingError for a malformed `windows.trigger`, the condition at which long recordings are cut.
     """
     about = p.description
     tables = tables_of(p)
     stems = {table.path: stem_of(about, table.path) for table in tables}
-    files = [*stems]
+    by_path = by_name = [*stems]
     if about.layout != "columns":
-        files.sort(key=lambda path: natural_key(stems[path]))
+        by_path = sorted(stems, key=lambda path: natural_key(stems[path]))
+        by_name = sorted(stems, key=file_key)
+    files = by_name
+    is_proved = proves_order([stems[path] for path in by_path])
     # While it is open where the label stands, any folder or word may be one of a verdict.
-    if about.label.column != UNKNOWN:
-        if proves_order([stems[path] for path in files]):
-            p.put("order", "name" if files == sorted(files, key=file_key) else "path")
-        else:
-            p.put(
-                "order",
-                UNKNOWN,
-                f"name: by file name, or path: folder by folder; {listed(files[:3])} prove "
-                "neither. If both are wrong, rename the files: a number, or year, month and day in "
-                "front",
-            )
+    is_known = about.label.column != UNKNOWN
+    if is_known and is_proved:
+        files = by_path
+        p.put("order", "name" if by_path == by_name else "path")
+    elif is_known:
+        p.put(
+            "order",
+            UNKNOWN,
+            f"name: by file name, or path: folder by folder; {listed(by_name[:3])} prove neither. "
+            "If both are wrong, rename the files: a number, or year, month and day in front",
+        )
     places = {path: place for place, path in enumerate(files)}
     tables.sort(key=lambda table: places[table.path])
     for place, other in unsorted_places(p, tables):

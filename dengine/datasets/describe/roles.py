@@ -21,10 +21,9 @@ from ..read.files import natural_key
 from ..read.recordings import is_dropped, kept_rows
 from ..read.split import match_numbered
 from ..units import quantity_of
-from .clock import COUNTER_NAME, is_clock, propose_clock, propose_rate
-from .clock import NAME as CLOCK_NAME
+from .clock import CLOCK_NAME, COUNTER_NAME, is_clock, propose_clock, propose_rate
 from .columns import FORCES, LOST, MOST_WORDS, Column, Proposal, columns_of, counts_of
-from .labels import NAME, lines_of, part_words, propose_label
+from .labels import VERDICT_NAME, lines_of, part_words, propose_label
 from .layout import PART_NAME
 from .order import propose_order
 from .text_form import is_numbering
@@ -155,7 +154,7 @@ def is_status(column: Column) -> bool:
 
     With texts, other than those for lost values (`LOST`), there may be more words.
     """
-    is_named = QUALIFIER_NAME.search(column.name) or NAME.fullmatch(column.name)
+    is_named = QUALIFIER_NAME.search(column.name) or VERDICT_NAME.fullmatch(column.name)
     return bool(is_named and (texts_of(column) or len(column.counts) <= MOST_WORDS))
 
 
