@@ -263,8 +263,8 @@ def table_in(p: Proposal, content: bytes, name: str) -> Table:
     stated the layout `npz`, `wide` or `long`, or no layout and it is the only file; otherwise as
     one part. Of a text or jsonl file of more than 2 MB only the whole lines of the first 2 MB are
     read (the whole file if no line ends there), and `p.is_cut` is set. Raises DataError if the file
-    is damaged, or if a line of a text file has a wrong number of cells; but such lines of the only
-    file are left out, unless all its lines are wrong.
+    is damaged. Lines of a text file with a wrong number of cells are left out, unless all lines are
+    wrong.
     """
     about = p.description
     if about.format in ("text", "jsonl") and len(content) > MOST_BYTES:
@@ -273,8 +273,6 @@ def table_in(p: Proposal, content: bytes, name: str) -> Table:
         p.is_cut = True
     if about.format == "text":
         table = read_text(content, name, about.text)
-        if len(p.names) > 1:
-            return table.whole()
         is_damaged = np.isin(table.lines, [error.line for error in table.damage])
         return replace(table.take(~is_damaged), damage=[])
     layout = p.stated.get("layout", "npz" if len(p.names) == 1 else "files")

@@ -127,7 +127,7 @@ def is_counter(column: Column) -> bool:
     is_even = are_even(steps, usual)
     if COUNTER_NAME.fullmatch(column.name):
         return usual < 0 or not is_even
-    is_channel = quantity_of(column.unit) or any(name.search(column.name) for name in FORCES[:2])
+    is_channel = quantity_of(column.unit) or any(name.search(column.name) for name in FORCES)
     return is_even and usual not in (0, 1) and not is_channel and ANY not in column.name
 
 

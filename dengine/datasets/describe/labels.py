@@ -97,12 +97,6 @@ def lists_words(source: LabelSource) -> bool:
     return LISTED.search(source.path) is not None
 
 
-def has_meaning(source: LabelSource, words: Names) -> bool:
-    """Return whether any of the words is known to mean good or bad (see `with_meanings`)."""
-    source = with_meanings(source, words)
-    return bool({*source.good, *source.bad} - {UNKNOWN})
-
-
 def in_paths(paths: Names) -> list[str]:
     """Return the regular expressions that find words like "ok" or "failed" in paths.
 
@@ -144,7 +138,9 @@ def may_be_labels(source: LabelSource, words: Names) -> bool:
     n = len({*words})
     if not is_named_like_verdict(source):
         return 2 <= n <= min(len(words) / 2, MOST_WORDS)
-    return 2 - has_meaning(source, words) <= n <= MOST_WORDS
+    meanings = with_meanings(source, words)
+    is_known = {*meanings.good, *meanings.bad} != {UNKNOWN}
+    return 2 - is_known <= n <= MOST_WORDS
 
 
 def lines_of(p: Proposal) -> list[str]:

@@ -248,8 +248,8 @@ def propose_channels(p: Proposal, units: Mapping[str, str]) -> None:
     forces = [name for name, unit in units.items() if (quantity_of(unit) or ("",))[0] in LOADS]
     likely = [name for name, unit in units.items() if not unit or name in forces]
     named = [[*filter(pattern.search, likely)] for pattern in FORCES]
-    others = [*dict.fromkeys([*named[1], *forces, *named[2]])]
-    best = next(filter(None, (named[0], others, [*units])), [])
+    others = [*dict.fromkeys([*named[1], *forces])]
+    best = named[0] or others or [*units]
     if not {*best} & {*forces}:
         best = [*best, *forces]  # one has the name, another the unit
     doubts = [*filter(None, (*(_doubt_on(p, name) for name in best), *_other_scales(p)))]

@@ -319,8 +319,7 @@ def propose_marks(p: Proposal, cells: Collection[str]) -> None:
     p.put("text.thousands", groups[0])
     is_both = any({*".,"} <= {*cell} for cell in cells)
     if groups[0] in (".", ",") and not is_both:
-        n_needed = most - n_read[marks[0], ""]
-        p.put("text.thousands", UNKNOWN, f"'.' or ',', or '' if there is none: {n_needed} need it")
+        p.put("text.thousands", UNKNOWN, "'.' or ',', or '' if there is none")
     marked = [cell for cell in cells if {*cell}.intersection(".,")]
     if marked and (len({*marks}) > 1 or most < LIKELY * len(cells)):
         p.put("text.decimal", UNKNOWN, f"'.' or ','; {min(marked)} may be a fraction or a thousand")
