@@ -20,7 +20,7 @@ from ...errors import DataError, listed
 from ..dataset import Faults
 from ..description import UNKNOWN, Stated, Strings, TextForm
 from ..read.files import caught
-from ..read.text import BLANK, COMMENT, LATIN, split_line, to_utf8, to_utf8_or_latin
+from ..read.text import BLANK, COMMENT, LATIN, header_names, split_line, to_utf8, to_utf8_or_latin
 from ..table import pattern_of
 from ..units import is_unit
 from .clock import EVEN
@@ -277,10 +277,12 @@ def _propose_keys(p: Proposal, looks: Sequence[Look]) -> None:
 def _column_names(usual: Look) -> Strings:
     """Return the names of columns for `text.names`; empty if the header names each column.
 
-    `#` or `%` at the beginning of the header is skipped. Without a header, or if it has another
-    number of cells than there are columns, the names are `c0`, `c1`, ...; for 20 columns or more it
-    is `x*`, which names all of them. Such a table may have a part in each row: if its first column
-    has 2 to 12 different words, all whole numbers, it is named `class`, before `x*`.
+    `#` or `%` at the beginning of the header is skipped. If it lacks the last column, and this is
+    empty in all rows, the names are those of the header and one like `column3`. Without a header,
+    or if it has another number of cells than there are columns, the names are `c0`, `c1`, ...; for
+    20 columns or more it is `x*`, which names all of them. Such a table may have a part in each
+    row: if its first column has 2 to 12 different words, all whole numbers, it is named `class`,
+    before `x*`.
 
     usual : how a typical file is written, and the cells of its samples.
     """
@@ -288,6 +290,9 @@ def _column_names(usual: Look) -> Strings:
     cells = split_line(COMMENT.sub("", usual.line.lstrip()), usual.form.delimiter)
     if len(cells) == width:
         return []
+    is_closed = not any(row[-1] for row in usual.rows if len(row) == width)
+    if is_closed and len(cells) == width - 1:
+        return header_names([*cells, ""])
     if width < MOST_NAMES:
         return [f"c{i}" for i in range(width)]
     firsts = {row[0] for row in usual.rows if row}
