@@ -6,10 +6,13 @@ that it holds a verdict. Any other place with few words is a candidate, if nothi
 """
 
 import re
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from itertools import permutations
+
+import numpy as np
 
 from ...errors import DataError
 from ..dataset import Faults
@@ -44,6 +47,7 @@ NEGATED = re.compile(  # or of a name that may be bad, as in `leak=False`
     rf"|(?-i:[-_ .]n)[-_ .](?!i))({WORD})"
     r"|[a-z][-_ .=(/]+(true|false)(?![a-z])"
 )
+ALONE = re.compile(rf"(?i)(?<![^-_ ./(=+\[])({WORD})(?![^-_ ./)\]])")
 PATHS = (  # of verdicts in folders, and at the end or beginning of names
     rf"(?:^|/)({WORD})/",
     rf"[-_ =]({WORD})/",
@@ -65,7 +69,9 @@ NAME_END = re.compile(r"[;:：=\t,]|  |(?<=[^\W\d]) (?=\d+[-./]\d+[-./]\d)")
 LISTED = re.compile(r"\((?!\?)(?:[\w /|-]|\\\W)+\)")  # a group of words, with escaped marks
 NO_LABEL = "none was found that is certain: state label.column, path, line or listing"
 Names = Iterable[str]
+CHANCE = 0.05  # that two words go with the labels like this
 Words = Mapping[str, str]  # by recording
+Meanings = Mapping[str, int | None]  # 1 good, 0 bad, None not checked, by word
 
 
 def with_meanings(source: LabelSource, words: Names) -> LabelSource:
@@ -102,14 +108,18 @@ def in_paths(paths: Names) -> list[str]:
 
     Such a word is or ends the name of a folder, or begins or ends a file name; numbers may stand
     behind it at the end. A word for unchecked is one, too, like "pending". Each expression has only
-    the words that it finds. The list is empty if any path negates such a word, like "not_passed",
-    or has true or false after a name, like "leak=False": the meaning is open then.
+    the words that it finds; one that finds folders at different heights above the files is left
+    out. The list is empty if any path negates such a word, like "not_passed", has true or false
+    after a name, like "leak=False", or words of both kinds, like "F=NOK_S=OK": the meaning is open
+    then.
     """
     stems = [*map(without_suffix, paths)]
+    kinds = [{w.lower() in BAD for w in ALONE.findall(stem)} for stem in stems]
     patterns = []
-    for pattern in () if any(map(NEGATED.search, stems)) else PATHS:
-        words = {m[1] for stem in stems if (m := re.search(f"(?i){pattern}", stem))}
-        if words:
+    for pattern in () if any(map(NEGATED.search, stems)) or {False, True} in kinds else PATHS:
+        found = [m for stem in stems if (m := re.search(f"(?i){pattern}", stem))]
+        words = {m[1] for m in found}
+        if len({m.string.count("/", m.end()) for m in found}) == 1:
             patterns.append(pattern.replace(WORD, "|".join(sorted(map(re.escape, words)))))
     return patterns
 
@@ -278,6 +288,29 @@ def n_contradictions(source: LabelSource, words: Words, other: LabelSource, othe
     return sum({source.meanings.get(a), other.meanings.get(b)} == {0, 1} for a, b in pairs)
 
 
+def may_contradict(source: LabelSource, words: Words, label: Words, meanings: Meanings) -> bool:
+    """Return whether a source whose words have no known meaning goes another way than the label.
+
+    It does if one of its words stands on good and on bad recordings, and the source either is named
+    like a verdict (`is_named_like_verdict`), or has two words that go with the labels beyond chance
+    (p below 5 % by Fisher's exact test): a folder `Ausschuss` with parts that the press calls OK.
+
+    words, label : the word of each recording in the source and in the label. meanings : 1 or 0 by
+    word of the label.
+    """
+    pairs = Counter(
+        (words[name], meanings[word])
+        for name, word in label.items()
+        if name in words and meanings.get(word) is not None
+    )
+    from scipy.stats import fisher_exact  # only here, since it takes a second to import
+
+    counts = np.array([[pairs[word, y] for y in (0, 1)] for word in {*words.values()}])
+    if not counts.all(1).any() or is_named_like_verdict(source):
+        return bool(counts.all(1).any())
+    return len(counts) == 2 and bool(fisher_exact(counts).pvalue < CHANCE)
+
+
 def propose_label(p: Proposal) -> None:
     """Set `[label]` and `[[check]]` in `p`: the source of the labels, and those that must agree.
 
@@ -307,8 +340,12 @@ def propose_label(p: Proposal) -> None:
     if certain:
         first = counted[certain[0]]
         n_odd = max(n_contradictions(certain[0], first, *other) for other in counted.items())
+        others = [s for s in counted if s not in known]
+        meanings = certain[0].meanings
         if n_odd:
             doubt = f"two of these disagree on {n_odd:,} of {len(first):,} recordings"
+        elif any(may_contradict(s, counted[s], first, meanings) for s in others):
+            doubt = "the words of another one may mean good and bad, too, and go another way"
     elif len({tuple(counted[s].items()) for s in (counted if known else named)}) != 1 or not named:
         doubt = NO_LABEL
     if doubt:

@@ -70,15 +70,15 @@ def line_word(lines: Strings, beginning: str) -> str:
 
     If several lines begin with it, those are used in which it fills the whole first cell; if there
     are none of these, all. Comment marks, quotes and delimiters before `beginning` are skipped. So
-    are blanks, tabs, quotes and `; , : =` behind it; then the word goes up to the next `;`, tab or
-    comma, without such marks at its end. Raises UnreadableError if no line begins with the text, or
-    if the words of several differ.
+    are blanks, tabs, quotes and `; , : =` behind it; then the word is the rest of the line, or what
+    stands before a comma with a blank behind it, without such marks at its end. Raises
+    UnreadableError if no line begins with the text, or if the words of several differ.
 
     lines : the lines above the header of a file.
     """
     words: set[str] = set()
     for end in ("(?=[\"' ]*([;:：=\t,]|  |$))", ""):
-        pattern = f"(?m)^[#%*{MARKS}]*{re.escape(beginning)}{end}[{MARKS}]*(?P<word>[^;\t,\n]*)"
+        pattern = f"(?m)^[#%*{MARKS}]*{re.escape(beginning)}{end}[{MARKS}]*(?P<word>([^,\n]|,(?! ))*)"
         found = re.finditer(pattern, "\n".join(lines))
         words = words or {match["word"].rstrip(MARKS) for match in found}
     if len(words) != 1:
