@@ -20,6 +20,7 @@ from ..description import (
 from ..read.files import natural_key
 from ..read.recordings import is_dropped, kept_rows
 from ..read.split import match_numbered
+from ..table import Table
 from ..units import quantity_of
 from .clock import CLOCK_NAME, COUNTER_NAME, is_clock, propose_clock, propose_rate
 from .columns import FORCES, LOST, MOST_WORDS, Column, Proposal, columns_of, counts_of
@@ -41,10 +42,7 @@ QUALIFIER_NAME = re.compile(
 )
 SIGNAL = re.compile(r"(?i)(force|kraft|torque|drehmoment|load|last)([_ ]?[xyz])?")
 LOADS = ("force", "torque")
-SENTINEL = re.compile(
-    r"(?i)[-+]?(9{4,}([.,](0+|9+))?|1([.,]0+)?e\+?3\d|9[.,]9\d*e\+?37|3[.,]40\d*e\+?38)"
-    r"|-999[.,](25|0+)|32767|-32768"
-)
+FAR = 3  # times the range of all other numbers, from which a repeated number is far outside
 WORD_BEGINS = r"(?i)(^|[^a-z]|(?-i:(?<=[a-z])(?=[A-Z])))"  # also in `forceUnit`
 SCALE_NAME = re.compile(
     WORD_BEGINS + r"(unit(?!.*(serial|id|no|nr|under))|uom|einheit|scale|scaling"
@@ -128,24 +126,26 @@ def complete_rows(p: Proposal) -> None:
 def qualify_rows(p: Proposal) -> None:
     """Set `[rows]` in `p` for the columns without another use that tell which rows are samples.
 
-    `may_qualify` says which ones they are. If the cells of such a column have several words, its
-    `keep` is `?`, with a note that counts them; if they have only one word, this becomes its
-    `keep`. Raises UnreadableError if cells are lists, and SettingError for a malformed
-    `windows.trigger`.
+    `may_qualify` says which ones they are; if nothing else is open, those with few whole numbers
+    (`is_phase`) are asked about, too. If the cells of such a column have several words, its `keep`
+    is `?`, with a note that counts them; if they have only one word, this becomes its `keep`.
+    Raises UnreadableError if cells are lists, and SettingError for a malformed `windows.trigger`.
     """
     rows = dict(p.description.rows)
     n_rows = max(column.counts.total() for column in p.columns.values())
-    for column in p.unused:
-        if may_qualify(column, n_rows):
-            words = tuple(column.counts)
-            if len(words) > 1:
-                p.notes[f"rows.{column.name}.keep"] = (
-                    f"which rows are samples? {counts_of(column.odd or column.counts)}; others "
-                    "drop or invalid; * is any other word; if one row has the label, state "
-                    "label.column, and label.at as first or last"
-                )
-                words = (UNKNOWN,)
-            rows[column.name] = RowWords(words)
+    found = [column for column in p.unused if may_qualify(column, n_rows)]
+    if not p.description.open_keys and all(len(column.counts) == 1 for column in found):
+        found += filter(is_phase, p.unused)
+    for column in found:
+        words = tuple(column.counts)
+        if len(words) > 1:
+            p.notes[f"rows.{column.name}.keep"] = (
+                f"which rows are samples? {counts_of(column.odd or column.counts)}; others "
+                "drop or invalid; * is any other word; if one row has the label, state "
+                "label.column, and label.at as first or last"
+            )
+            words = (UNKNOWN,)
+        rows[column.name] = RowWords(words)
     p.description = replace(p.description, rows=rows)
 
 
@@ -182,6 +182,16 @@ def may_qualify(column: Column, n_rows: int) -> bool:
     if len(words) > 1:
         return any(map(SIGNAL.fullmatch, words))
     return QUALIFIER_NAME.search(column.name) is not None
+
+
+def is_phase(column: Column) -> bool:
+    """Return whether a column has 2 to 12 whole numbers that last for two rows or more on average.
+
+    Each recording has all its cells, and the numbers change within a recording.
+    """
+    n = len(column.counts)
+    is_whole = 1 < n <= MOST_WORDS and not (column.odd or (column.steps % 1).any())
+    return is_whole and not column.fixed and 2 * column.n_runs <= column.counts.total()
 
 
 def sources_named(p: Proposal, column: re.Pattern[str], line: re.Pattern[str]) -> list[PartSource]:
@@ -310,7 +320,7 @@ def find_lost(p: Proposal) -> None:
 
     `p` is the description so far. The words are those already there, and those of `LOST`, like
     `nan`, `-` or the empty cell, that a channel has, in any case of letters. If another text is in
-    more than 1 % of a channel's cells, or if one of them has a number like -9999 in a text file,
+    more than 1 % of a channel's cells, or if one of them has a number like -9999 (`far_outliers`),
     `text.missing` is `?`, with a note. So it is if more than 10 % of the cells of a channel are
     empty and `time.column` is set, even to `?`: these rows may belong to another signal. A stated
     `text.missing` stays.
@@ -326,8 +336,7 @@ def find_lost(p: Proposal) -> None:
                 missing.add(word)
             elif n > STRANGE * n_cells and word not in missing:
                 strange[word] = n
-        if p.description.format == "text":
-            strange |= {word: n for word, n in column.counts.items() if SENTINEL.fullmatch(word)}
+        strange |= far_outliers(column)
     p.put("text.missing", sorted(missing))
     if strange:
         p.put(
@@ -337,6 +346,28 @@ def find_lost(p: Proposal) -> None:
             f"{[*sorted(missing), *strange]}; rows of another signal: rows.COLUMN.drop, and "
             "channels.COLUMN",
         )
+
+
+def far_outliers(column: Column) -> dict[str, int]:
+    """Return how often each word comes that is a number far outside all others, like -9999.
+
+    It comes twice or more, and lies below or above the others by more than three times their range,
+    the other such numbers left out. These are marks for lost samples or for overflow.
+    """
+    words = np.array([word for word in column.counts if word not in column.odd], dtype=object)
+    found = dict[str, int]()
+    with suppress(DataError):
+        numbers = Table(column.name, {column.name: words}, []).numbers(column.name, column.form)
+        order = np.argsort(numbers)
+        while len(order) > 3:
+            steps = np.diff(numbers[order])
+            last = 0 if steps[0] > steps[-1] else -1
+            word = words[order[last]]
+            order = np.delete(order, last)
+            if column.counts[word] < 2 or steps[last] <= FAR * np.ptp(numbers[order]):
+                break
+            found[word] = column.counts[word]
+    return found
 
 
 def propose_lengths(p: Proposal) -> None:
