@@ -30,6 +30,11 @@ def quantity_of(unit: str) -> tuple[str, float] | None:
     return UNITS.get(unit)
 
 
+def is_load(unit: str) -> bool:
+    """Return whether a unit, without brackets, is one of force or torque."""
+    return (quantity_of(unit) or ("",))[0] in ("force", "torque")
+
+
 def is_unit(text: str) -> bool:
     """Return whether a text is a unit of this table, with or without brackets.
 
@@ -57,10 +62,11 @@ def unit_in(name: str) -> str:
     """Return the unit at the end of a column's name, as in `Kraft [N]` or `F_kN`; "" if none.
 
     It must be a unit in `units.toml`, in brackets, or behind `in`, `/`, `_` or `..`, and is
-    returned without them; a point or `_` behind it (`Force..N.`, `Force_N_`) is left out. Behind
-    `/` or `_` a single character is none, except N: `Fz_W` is a force in world axes.
+    returned without them; a point or `_` behind it (`Force..N.`, `Force_N_`) is left out. What is
+    in brackets or behind `in` counts as a whole: `Force [N/mm]` has none. Behind `/` or `_` a
+    single character is none, except N: `Fz_W` is a force in world axes.
     """
-    match = re.search(
-        r"(?:[\[({<]|\bin |\.\.|[/_](?![^N][_.]?$))\s*([^\[\](){}<>/_ ]+?)\s*[\])}>_.]?$", name
+    match = re.search(r"(?:[\[({<]|\bin )\s*([^\[\](){}<>]+?)\s*[\])}>_.]?$", name) or re.search(
+        r"(?:\.\.|[/_](?![^N][_.]?$))\s*([^\[\](){}<>/_ ]+?)[_.]?$", name
     )
     return match[1] if match and is_unit(match[1]) else ""

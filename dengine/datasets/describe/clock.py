@@ -28,7 +28,7 @@ CLOCK_NAME = re.compile(
 )
 COUNTER_NAME = re.compile(r"(?i)(index|row|sample|n|i|punkt|point|count|nr|no|line)s?")
 UNIT_IN_NAME = re.compile(
-    r"(?:[\[(/_ ]|\.\.|in )\s*((?:[\d.,]+ ?)?(?:s|ms|us|µs|ns|min|h|[mun]?sec))\s*[\])_.]?$"
+    r"(?:[\[(_]|(?<![\dE.])[/ ]|\.\.|\bin )\s*((?:[\d.,]+ ?)?(?:s|ms|us|µs|ns|min|h|[mun]?sec))\s*[\])_.]?$"
 )
 # Names that are a unit. Whole seconds and nanoseconds may stand in two columns beside each other.
 NAMED_UNIT = re.compile(

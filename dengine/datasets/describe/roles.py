@@ -21,7 +21,7 @@ from ..read.files import natural_key
 from ..read.recordings import is_dropped, kept_rows
 from ..read.split import match_numbered
 from ..table import Table
-from ..units import quantity_of
+from ..units import is_load, is_unit
 from .clock import CLOCK_NAME, COUNTER_NAME, is_clock, propose_clock, propose_rate
 from .columns import FORCES, LOST, MOST_WORDS, Column, Proposal, columns_of, counts_of
 from .labels import VERDICT_NAME, lines_of, part_words, propose_label
@@ -41,15 +41,20 @@ QUALIFIER_NAME = re.compile(
     r"|[ _.](ok|io)$|^qc?$"
 )
 SIGNAL = re.compile(r"(?i)(force|kraft|torque|drehmoment|load|last)([_ ]?[xyz])?")
-LOADS = ("force", "torque")
 FAR = 3  # times the range of all other numbers, from which a repeated number is far outside
 WORD_BEGINS = r"(?i)(^|[^a-z]|(?-i:(?<=[a-z])(?=[A-Z])))"  # also in `forceUnit`
 SCALE_NAME = re.compile(
     WORD_BEGINS + r"(unit(?!.*(serial|id|no|nr|under))|uom|einheit|scale|scaling"
-    r"|factor|faktor|gain|sensitivity|fs|dt|frequency|interval"
-    r"|(sampl\w*|abtast|scan|data)[ _]?(rate|freq\w*))s?($|[^a-z])"
+    r"|factor|faktor|gain|sensitivity|fs|dt|frequency|interval|takt"
+    r"|(sampl\w*|abtast|scan|data|mess)[ _]?(rate|freq\w*))s?($|[^a-z])"
 )
-SET_VALUE = re.compile(WORD_BEGINS + r"(set|soll|vorgabe|nominal|target|consigne|max|min|limit)")
+SET_VALUE = re.compile(
+    WORD_BEGINS
+    + r"(set|vorgabe|nominal|target|consigne|max|min|limit|(cmd|des|ref)(?![a-z])|comm?and"
+    r"|desired|demand)|soll|grenz"
+)
+WITH_UNIT = re.compile(r"(?i)\d[\d.,]* ?(k?hz|[muµ]?s|s/s|k?n)")
+ANY_NAME = re.compile("")
 
 
 def propose_roles(p: Proposal) -> None:
@@ -255,7 +260,7 @@ def propose_channels(p: Proposal, units: Mapping[str, str]) -> None:
     """
     if p.description.channels:
         return
-    forces = [name for name, unit in units.items() if (quantity_of(unit) or ("",))[0] in LOADS]
+    forces = [name for name, unit in units.items() if is_load(unit)]
     likely = [name for name, unit in units.items() if not unit or name in forces]
     named = [[*filter(pattern.search, likely)] for pattern in FORCES]
     others = [*dict.fromkeys([*named[1], *forces])]
@@ -291,18 +296,17 @@ def _doubt_on(p: Proposal, name: str) -> str:
 def _other_scales(p: Proposal) -> Iterator[str]:
     """Yield a text for each column or line above the header that shows that scales differ.
 
-    It is named like a unit, a factor or a rate, and its word is not the same in all recordings.
-    Recordings in which it is missing, empty or changes are ignored. The columns are those without a
+    It is named like a unit, a factor or a rate, or all its words are units, or numbers with one,
+    and its word is not the same in all recordings. Recordings in which it is missing, empty or changes are ignored. The columns are those without a
     role (such as channel, clock or label), and the lines are those of the first table. Raises
     SettingError for a malformed `windows.trigger`.
     """
-    for source in sources_named(p, SCALE_NAME, SCALE_NAME):
+    for source in sources_named(p, ANY_NAME, ANY_NAME):
+        name = source.line or source.column[0]
         words = part_words(source, p.tables).values()
-        if len({*words}) > 1:
-            yield (
-                f"{source.line or source.column[0]} differs, {counts_of(words)}: convert them "
-                "first, or state channels"
-            )
+        are_units = all(is_unit(word) or WITH_UNIT.fullmatch(word) for word in words)
+        if len({*words}) > 1 and (are_units or SCALE_NAME.search(name)):
+            yield f"{name} differs, {counts_of(words)}: convert them first, or state channels"
 
 
 def may_be_channel(column: Column) -> bool:

@@ -78,7 +78,9 @@ def line_word(lines: Strings, beginning: str) -> str:
     """
     words: set[str] = set()
     for end in ("(?=[\"' ]*([;:：=\t,]|  |$))", ""):
-        pattern = f"(?m)^[#%*{MARKS}]*{re.escape(beginning)}{end}[{MARKS}]*(?P<word>([^,\n]|,(?! ))*)"
+        pattern = (
+            f"(?m)^[#%*{MARKS}]*{re.escape(beginning)}{end}[{MARKS}]*(?P<word>([^,\n]|,(?! ))*)"
+        )
         found = re.finditer(pattern, "\n".join(lines))
         words = words or {match["word"].rstrip(MARKS) for match in found}
     if len(words) != 1:
