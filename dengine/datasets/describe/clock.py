@@ -28,7 +28,8 @@ CLOCK_NAME = re.compile(
 )
 COUNTER_NAME = re.compile(r"(?i)(index|row|sample|n|i|punkt|point|count|nr|no|line)s?")
 UNIT_IN_NAME = re.compile(
-    r"(?:[\[(_]|(?<![\dE.])[/ ]|\.\.|\bin )\s*((?:[\d.,]+ ?)?(?:s|ms|us|µs|ns|min|h|[mun]?sec))\s*[\])_.]?$"
+    r"(?:[\[(_]|(?<![\dE.])[/ ]|\.\.|\bin )\s*"  # behind a number it is arithmetic, like 1/10 ms
+    r"((?:[\d.,]+ ?)?(?:s|ms|us|µs|ns|min|h|[mun]?sec))\s*[\])_.]?$"
 )
 # Names that are a unit. Whole seconds and nanoseconds may stand in two columns beside each other.
 NAMED_UNIT = re.compile(

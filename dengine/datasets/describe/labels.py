@@ -14,7 +14,7 @@ from itertools import permutations
 
 import numpy as np
 
-from ...errors import DataError
+from ...errors import DataError, listed
 from ..dataset import Faults
 from ..description import SOURCES, UNKNOWN, Description, LabelSource, PartSource
 from ..read.files import caught
@@ -288,6 +288,22 @@ def n_contradictions(source: LabelSource, words: Words, other: LabelSource, othe
     return sum({source.meanings.get(a), other.meanings.get(b)} == {0, 1} for a, b in pairs)
 
 
+def unmatched(p: Proposal, counted: Iterable[LabelSource]) -> Iterator[str]:
+    """Yield a text on each verdict of a listing of which `counted` has no source.
+
+    `counted` are the sources of labels for recordings of `p`. A listing is a file with a row for
+    each recording or part, and its verdict a column that is named like one.
+    """
+    listings = {source.listing for source in counted}
+    for source in sources_of(p, ()):
+        if source.listing and source.listing not in listings and is_named_like_verdict(source):
+            keys = p.read_listing(source.listing).words(source.key)
+            yield (
+                f"{source.listing} has {source.column}, but {source.key} names no recording: "
+                f"{listed(keys[:2])}; if a path contains the key, state part.path"
+            )
+
+
 def may_contradict(source: LabelSource, words: Words, label: Words, meanings: Meanings) -> bool:
     """Return whether a source whose words have no known meaning goes another way than the label.
 
@@ -298,17 +314,35 @@ def may_contradict(source: LabelSource, words: Words, label: Words, meanings: Me
     words, label : the word of each recording in the source and in the label. meanings : 1 or 0 by
     word of the label.
     """
-    pairs = Counter(
-        (words[name], meanings[word])
-        for name, word in label.items()
-        if name in words and meanings.get(word) is not None
-    )
     from scipy.stats import fisher_exact  # only here, since it takes a second to import
 
+    pairs = Counter((words.get(name), meanings.get(word)) for name, word in label.items())
     counts = np.array([[pairs[word, y] for y in (0, 1)] for word in {*words.values()}])
-    if not counts.all(1).any() or is_named_like_verdict(source):
-        return bool(counts.all(1).any())
-    return len(counts) == 2 and bool(fisher_exact(counts).pvalue < CHANCE)
+    is_mixed = counts.all(1).any()
+    if not is_named_like_verdict(source):
+        is_mixed &= len(counts) == 2 and fisher_exact(counts).pvalue < CHANCE
+    return bool(is_mixed)
+
+
+def is_known(source: LabelSource, words: Names) -> bool:
+    """Return whether all words of a source mean good, bad or not checked."""
+    return {*words} <= source.meanings.keys()
+
+
+def doubt_on(label: LabelSource, counted: Mapping[LabelSource, Words]) -> str:
+    """Return why a source, though certain in itself, may not be the label; "" if nothing does.
+
+    `counted` has the words of each source, by recording. Another source may say bad where this one
+    says good, or have words without a known meaning that go another way (`may_contradict`).
+    """
+    words = counted[label]
+    for source, others in counted.items():
+        if n_odd := n_contradictions(label, words, source, others):
+            return f"two of these disagree on {n_odd:,} of {len(words):,} recordings"
+        contradicts = may_contradict(source, others, words, label.meanings)
+        if contradicts and not is_known(source, others.values()):
+            return "the words of another one may mean good and bad, too, and go another way"
+    return ""
 
 
 def propose_label(p: Proposal) -> None:
@@ -318,38 +352,31 @@ def propose_label(p: Proposal) -> None:
     listing (a file with a row for each recording). It is certain if it is named like a verdict
     (`is_named_like_verdict`) or stated by the user, has words for good and for bad, and all its
     words have a known meaning. The first certain source becomes the label, unless another source
-    contradicts it: good by one, bad by the other. If none is certain, but only one is named like a
-    verdict or stated, this source becomes the label. Its `good` or `bad` is `?` if none of its
-    words is known to mean that; a word of unknown meaning is in neither list. But if any source has
-    only known words, it becomes the label only if there is no other source. Sources that have the
-    same word for each recording count as one here, and the first that is named like a verdict is
-    used. Otherwise `label.column` is `?`, with a note that lists all sources. Further certain
-    sources that have a word for each recording of the label become checks, unless checks are
-    stated; a note counts the words of the label, also on `label.good` and `label.bad` if these are
-    `?`. Raises DataError if a stated source has no words or cannot be read, or, if none is stated,
-    if cells of a column without another use are lists; and SettingError for a malformed
-    `windows.trigger`, the condition at which long recordings are cut.
+    contradicts it (`doubt_on`). If none is certain, but only one is named like a verdict or stated,
+    this source becomes the label. Its `good` or `bad` is `?` if none of its words is known to mean
+    that; a word of unknown meaning is in neither list. But if any source has only known words, it
+    becomes the label only if there is no other source. Sources that have the same word for each
+    recording count as one here, and the first that is named like a verdict is used. Otherwise
+    `label.column` is `?`, with a note that lists all sources, and the listings with a verdict that
+    name no recording. Further certain sources that have a word for each recording of the label
+    become checks, unless checks are stated; a note counts the words of the label, also on
+    `label.good` and `label.bad` if these are `?`. Raises DataError if a stated source has no words
+    or cannot be read, or, if none is stated, if cells of a column without another use are lists;
+    and SettingError for a malformed `windows.trigger`, the condition at which long recordings are
+    cut.
     """
     label = p.description.label
     stated = [label] if any(getattr(label, kind) for kind in SOURCES) else []
     counted = count_sources(p, stated)
     named = [source for source in counted if stated or is_named_like_verdict(source)]
-    known = [s for s, words in counted.items() if {*words.values()} <= s.meanings.keys()]
+    known = [s for s, words in counted.items() if is_known(s, words.values())]
     certain = [s for s in known if s in named and UNKNOWN not in s.good + s.bad]
-    doubt = ""
+    rivals = {tuple(counted[source].items()) for source in (counted if known else named)}
+    doubt = "" if named and len(rivals) == 1 else NO_LABEL
     if certain:
-        first = counted[certain[0]]
-        n_odd = max(n_contradictions(certain[0], first, *other) for other in counted.items())
-        others = [s for s in counted if s not in known]
-        meanings = certain[0].meanings
-        if n_odd:
-            doubt = f"two of these disagree on {n_odd:,} of {len(first):,} recordings"
-        elif any(may_contradict(s, counted[s], first, meanings) for s in others):
-            doubt = "the words of another one may mean good and bad, too, and go another way"
-    elif len({tuple(counted[s].items()) for s in (counted if known else named)}) != 1 or not named:
-        doubt = NO_LABEL
+        doubt = doubt_on(certain[0], counted)
     if doubt:
-        titles = [*map(title_of, counted, counted.values()), doubt]
+        titles = [*map(title_of, counted, counted.values()), *unmatched(p, counted), doubt]
         p.put("label.column", UNKNOWN, "; ".join(titles))
         return
     label = (certain or named)[0]
@@ -359,8 +386,6 @@ def propose_label(p: Proposal) -> None:
     place = next(kind for kind in SOURCES if getattr(label, kind))
     note = f"{counts_of(words.values())}, over {len(words):,} recordings"
     p.notes[f"label.{place}"] = note
-    p.notes |= {
-        f"label.{key}": f"which words, also one that may come? {note}"
-        for key in ("good", "bad")
-        if UNKNOWN in getattr(label, key)
-    }
+    for key in ("good", "bad"):
+        if UNKNOWN in getattr(label, key):
+            p.notes[f"label.{key}"] = f"which words, also one that may come? {note}"

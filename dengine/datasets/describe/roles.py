@@ -131,36 +131,34 @@ def complete_rows(p: Proposal) -> None:
 def qualify_rows(p: Proposal) -> None:
     """Set `[rows]` in `p` for the columns without another use that tell which rows are samples.
 
-    `may_qualify` says which ones they are; if nothing else is open, those with few whole numbers
-    (`is_phase`) are asked about, too. If the cells of such a column have several words, its `keep`
-    is `?`, with a note that counts them; if they have only one word, this becomes its `keep`.
-    Raises UnreadableError if cells are lists, and SettingError for a malformed `windows.trigger`.
+    `may_qualify` says which ones they are. If the cells of such a column have several words, its
+    `keep` is `?`, with a note that counts them; if they have only one word, this becomes its
+    `keep`. Raises UnreadableError if cells are lists, and SettingError for a malformed
+    `windows.trigger`.
     """
     rows = dict(p.description.rows)
     n_rows = max(column.counts.total() for column in p.columns.values())
-    found = [column for column in p.unused if may_qualify(column, n_rows)]
-    if not p.description.open_keys and all(len(column.counts) == 1 for column in found):
-        found += filter(is_phase, p.unused)
-    for column in found:
-        words = tuple(column.counts)
-        if len(words) > 1:
-            p.notes[f"rows.{column.name}.keep"] = (
-                f"which rows are samples? {counts_of(column.odd or column.counts)}; others "
-                "drop or invalid; * is any other word; if one row has the label, state "
-                "label.column, and label.at as first or last"
-            )
-            words = (UNKNOWN,)
-        rows[column.name] = RowWords(words)
+    for column in p.unused:
+        if may_qualify(column, n_rows):
+            words = tuple(column.counts)
+            if len(words) > 1:
+                p.notes[f"rows.{column.name}.keep"] = (
+                    f"which rows are samples? {counts_of(column.odd or column.counts)}; others "
+                    "drop or invalid; * is any other word; if one row has the label, state "
+                    "label.column, and label.at as first or last"
+                )
+                words = (UNKNOWN,)
+            rows[column.name] = RowWords(words)
     p.description = replace(p.description, rows=rows)
 
 
 def is_status(column: Column) -> bool:
-    """Return whether a column is named like a status or verdict, and has at most 12 words or texts.
+    """Return whether a column is named like a status or verdict, and has texts, or few numbers.
 
-    With texts, other than those for lost values (`LOST`), there may be more words.
+    Texts are those for lost values (`LOST`) left out; for numbers see `is_phase`.
     """
     is_named = QUALIFIER_NAME.search(column.name) or VERDICT_NAME.fullmatch(column.name)
-    return bool(is_named and (texts_of(column) or len(column.counts) <= MOST_WORDS))
+    return bool(is_named and texts_of(column)) or is_phase(column)
 
 
 def texts_of(column: Column) -> set[str]:
@@ -297,9 +295,9 @@ def _other_scales(p: Proposal) -> Iterator[str]:
     """Yield a text for each column or line above the header that shows that scales differ.
 
     It is named like a unit, a factor or a rate, or all its words are units, or numbers with one,
-    and its word is not the same in all recordings. Recordings in which it is missing, empty or changes are ignored. The columns are those without a
-    role (such as channel, clock or label), and the lines are those of the first table. Raises
-    SettingError for a malformed `windows.trigger`.
+    and its word is not the same in all recordings. Recordings in which it is missing, empty or
+    changes are ignored. The columns are those without a role (such as channel, clock or label), and
+    the lines are those of the first table. Raises SettingError for a malformed `windows.trigger`.
     """
     for source in sources_named(p, ANY_NAME, ANY_NAME):
         name = source.line or source.column[0]

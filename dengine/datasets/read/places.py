@@ -167,12 +167,14 @@ def in_listing(name: str) -> Iterator[None]:
 class LabelReader:
     """Finds the label of a recording in one source.
 
-    listing : the different words by key, if the source is a listing. used : the keys that were
-    found in it, each with the path of the first recording that has it.
+    listing : the different words by key, if the source is a listing. is_short : whether keys are
+    compared in their short form (`as_key`), since no two of the listing are the same then. used :
+    the keys that were found, each with the path of the first recording that has it.
     """
 
     source: LabelSource
     listing: Mapping[str, set[str]]
+    is_short: bool
     used: dict[str, str] = field(default_factory=dict)
 
     def word(self, table: Table, part: str) -> str:
@@ -201,14 +203,15 @@ class LabelReader:
             return words_of(source, table, [source.column or source.topic], source.at)[0]
         name = path.rpartition("/")[2]
         names = filter(None, (part, path, name, without_suffix(path), without_suffix(name)))
-        keys = [key for key in map(as_key, names) if key in self.listing]
+        keys = [as_key(name, self.is_short) for name in names]
+        keys = [key for key in keys if key in self.listing]
         if not keys:
             raise UnreadableError(
                 f"Expected {part or name} in {source.listing}, it is not listed; it has "
                 f"{listed(sorted(self.listing)[:2])}; if its name contains the key, state part.path"
             )
         key = keys[0]
-        if self.used.setdefault(key, path) != path and key != as_key(part):
+        if self.used.setdefault(key, path) != path and key != as_key(part, self.is_short):
             raise UnreadableError(
                 f"Expected one file for {key} in {source.listing}, got {self.used[key]} before"
             )
@@ -257,15 +260,18 @@ class LabelReader:
         )
 
 
-def as_key(word: str) -> str:
-    """Return a word as a key of a listing, so that keys are equal if they mean the same.
+def as_key(word: str, is_short: bool) -> str:
+    r"""Return a word as a key of a listing, so that keys are equal if they mean the same.
 
-    A number loses its leading zeros, a backslash becomes `/`, and a word with a file's suffix is
-    put in small letters. `="0012"`, like Excel writes a text, is the number 0012, and becomes `12`.
+    A whole number loses its leading zeros, and a fraction `.0`; a backslash becomes `/`, and
+    letters become small. `="0012"`, like Excel writes a text, is the number 0012, and becomes `12`.
+    A short key has no folder, no suffix of a file, and no leading zeros of any number in it:
+    `C:\Data\P007.tdms` becomes `p7`.
     """
-    word = word.removeprefix("=").strip('"')
-    word = word.lower() if SUFFIX.search(word) else word
-    return word.lstrip("0") or "0" if word.isdecimal() else word.replace("\\", "/")
+    word = word.removeprefix("=").strip('"').replace("\\", "/").lower()
+    word = re.sub(r"^0*(\d+)(\.0+)?$", r"\1", word)
+    name = without_suffix(word.rpartition("/")[2])
+    return re.sub(r"(?<!\d)0+(?=\d)", "", name) if is_short else word
 
 
 def read_labels(source: LabelSource, read_listing: ListingReader) -> LabelReader:
@@ -279,12 +285,15 @@ def read_labels(source: LabelSource, read_listing: ListingReader) -> LabelReader
     here.
     """
     listing = defaultdict[str, set[str]](set)
+    is_short = False
     if source.listing:
         columns = (source.key, source.column)
         if not all(columns):
             raise DataError("Expected label.key and label.column, two columns of label.listing.")
         with in_listing(source.listing):
             table = read_listing(source.listing)
-            for key, word in zip(*map(table.words, columns), strict=True):
-                listing[as_key(key)].add(word)
-    return LabelReader(source, listing)
+            keys, words = map(table.words, columns)
+            is_short = len({as_key(key, True) for key in keys}) == len({*keys})
+            for key, word in zip(keys, words, strict=True):
+                listing[as_key(key, is_short)].add(word)
+    return LabelReader(source, listing, is_short)
