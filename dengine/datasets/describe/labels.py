@@ -28,7 +28,8 @@ GOOD = (
 )  # fmt: skip
 BAD = (
     "nok", "not ok", "not_ok", "not-ok", "fail", "failed", "bad", "failure", "schlecht",
-    "n.i.o.", "n.i.o", "n_i_o", "n-io", "n_io", "nio", "ng", "reject", "rejected", "不合格",
+    "n.i.o.", "n.i.o", "n_i_o", "n-io", "n_io", "n io", "n.io", "nio", "ng",
+    "reject", "rejected", "不合格",
 )  # fmt: skip
 UNCHECKED = ("", "-", "--", "pending", "open", "offen", "unchecked", "not checked", "n/a")
 YES = ("1", "true", "yes", "ja")
@@ -51,7 +52,7 @@ ALONE = re.compile(rf"(?i)(?<![^-_ ./(=+\[])({WORD})(?![^-_ ./)\]])")
 PATHS = (  # of verdicts in folders, and at the end or beginning of names
     rf"(?:^|/)({WORD})/",
     rf"[-_ =]({WORD})/",
-    rf"(?:^|[-_ ./(=+\[])({WORD})[-_ \d()\]]*$",
+    rf"(?:^|[-_ ./(=+\[\d#（])({WORD})[-_ \d()\]）]*$",
     rf"(?:^|/)({WORD})(?=[-_ ][^/]*$)",
 )
 PLACES = (  # of any words: folders, and the words of a file's name, counted from the end
