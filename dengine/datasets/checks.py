@@ -23,11 +23,11 @@ def check_description(description: Description) -> None:
     A description says how recordings are read. No key may have the value `?` (not known yet),
     except in `[ignored]` and `[[check]]`. The number of samples of a trace must be 1 or more. There
     must be a channel, and all channels must have the same `limit`, the range of the sensor. If the
-    `order` of the parts is "time", there must be a column of times, and a rate if such a column is
-    resampled. The settings in `[time]` and
-    `[text]` must be valid, for example name an encoding that Python knows (`check_forms`). Nothing
-    else is checked: neither a trigger (the condition at which a part begins) nor a regular
-    expression, nor whether columns exist.
+    `order` of the parts is "time", there must be a column of times. If recordings with a column of
+    times are resampled, there must be a rate. The settings in `[time]` and `[text]` must be valid,
+    for example name an encoding that Python knows (`check_forms`). Nothing else is checked: neither
+    a trigger (the condition at which a part begins) nor a regular expression, nor whether columns
+    exist.
     """
     if open_keys := description.open_keys:
         raise DataError(f"Expected a description without ?, still open: {listed(open_keys)}.")

@@ -115,7 +115,8 @@ class Clock:
     zone
         Time zone of dates that state none, like `Europe/Berlin`; empty: UTC.
     rate_hz
-        Sampling rate in hertz, which the times must agree with; 0: unknown.
+        Sampling rate in hertz, which the times must agree with; 0: unknown. `lengths = "resample"`
+        needs it if there is a column of times.
     wrap
         Value at which a counter of times begins again at 0; 0: it never does.
     gap
@@ -181,13 +182,15 @@ class LabelSource:
         Regular expression with one group, searched in the path without suffix; the text of the
         group is the value.
     line
-        Beginning of a line above the header, in front of the label.
+        Beginning of a line above the header, in front of the label, which is the rest of the line,
+        up to a comma with a blank behind it.
     topic
         Topic of a bag whose next message is the label.
     listing
         File beside the recordings that lists the labels, in its `column`.
     key
-        Column of the listing with the part's number or the recording's file.
+        Column of the listing with the part's number or the recording's file. Capital letters do not
+        count, nor, in a file, its suffix, leading zeros, and folders that only one of both has.
     at
         Which row has the label, if it changes within a recording: `same`, `first` or `last`.
     good

@@ -13,6 +13,8 @@ OTHERS = TABLE.pop("others")["units"]
 UNITS: dict[str, tuple[str, float]] = {
     unit: (name, factor) for name, units in TABLE.items() for unit, factor in units.items()
 }
+# A unit, also behind a number, as in `2 ms`.
+QUANTITY = re.compile(rf"(\d[\d.,]* ?)?(k?Hz|{'|'.join(map(re.escape, UNITS))})")
 MARKS = "[](){} "
 
 
@@ -64,9 +66,9 @@ def unit_in(name: str) -> str:
     It must be a unit in `units.toml`, in brackets, or behind `in`, `/`, `_` or `..`, and is
     returned without them; a point or `_` behind it (`Force..N.`, `Force_N_`) is left out. What is
     in brackets or behind `in` counts as a whole: `Force [N/mm]` has none. Behind `/` or `_` a
-    single character is none, except N: `Fz_W` is a force in world axes.
+    single character is none, except N, and `in`: `Fz_W` is a force in world axes.
     """
-    match = re.search(r"(?:[\[({<]|\bin )\s*([^\[\](){}<>]+?)\s*[\])}>_.]?$", name) or re.search(
-        r"(?:\.\.|[/_](?![^N][_.]?$))\s*([^\[\](){}<>/_ ]+?)[_.]?$", name
+    match = re.search(r"(?:[\[({<]|\bin )\s*([^\[\](){}<>_]+?)\s*[\])}>_.]?$", name) or re.search(
+        r"(?:\.\.|[/_](?!(?:[^N]|in)[_.]?$))\s*([^\[\](){}<>/_ ]+?)[_.]?$", name
     )
     return match[1] if match and is_unit(match[1]) else ""

@@ -237,11 +237,12 @@ def read_tables(p: Proposal) -> list[Table]:
     """
     contents = dict[str, bytes]()
     faults: Faults = []
-    for i in sorted({*np.linspace(0, len(p.names) - 1, MOST_FILES).astype(int)}):
+    size = (p.base / p.names[0]).stat().st_size + 1
+    n = min(MOST_FILES, max(3, MOST_BYTES // size))
+    for i in sorted({*np.linspace(0, len(p.names) - 1, n).astype(int)}):
         name = p.names[i]
-        if sum(map(len, contents.values())) < MOST_BYTES:
-            with caught(faults, name):
-                contents[name] = read_file(p.base / name)
+        with caught(faults, name):
+            contents[name] = read_file(p.base / name)
     names = propose_form(p, contents, faults) if p.description.format == "text" else contents
     files = list[Table]()
     for name in names:

@@ -28,7 +28,7 @@ CLOCK_NAME = re.compile(
 )
 COUNTER_NAME = re.compile(r"(?i)(index|row|sample|n|i|punkt|point|count|nr|no|line)s?")
 UNIT_IN_NAME = re.compile(
-    r"(?:[\[(_]|(?<![\dE.])[/ ]|\.\.|\bin )\s*"  # behind a number it is arithmetic, like 1/10 ms
+    r"(?:[\[(_]|(?<![\d.])[/ ]|\.\.|\bin )\s*"  # behind a number it is arithmetic, like 1/10 ms
     r"((?:[\d.,]+ ?)?(?:s|ms|us|µs|ns|min|h|[mun]?sec))\s*[\])_.]?$"
 )
 # Names that are a unit. Whole seconds and nanoseconds may stand in two columns beside each other.
@@ -140,9 +140,9 @@ def are_even(steps: Floats, usual: float) -> bool:
 def epoch_of(column: Column) -> str:
     """Return the unit in which a column of times counts from a known day; "" if it does not.
 
-    In this unit the first number is a time in the years 2000 to 2049, counted from 1970 or from
-    another day that clocks use, and the usual step (`Column.usual_step`) is that of a rate of 1 Hz
-    to 1 MHz. Of several such units the first in `EPOCHS`, the list of those that are tried, is
+    In this unit the first number is a time in the years 2000 to 2049, counted from 1970, or in days
+    from 1900 as spreadsheets count, and the usual step (`Column.usual_step`) is that of a rate of
+    1 Hz to 1 MHz. Of several such units the first in `EPOCHS`, which has those that are tried, is
     returned.
     """
     for unit, zero in EPOCHS.items():
@@ -216,18 +216,18 @@ def propose_rate(p: Proposal, tables: Tables) -> None:
 
     `p` is the description so far; stated keys stay. `tables` has the samples of each recording.
     With `time.sort` the times of each are sorted first. Steps below 0 are left out of the mean, and
-    the rate is rounded to five digits. It is
-    `?` (the user must answer), with a note, if it is not between 1 Hz and 1 MHz, like that of times
-    that only fall; then `time.gap`, the longest step that is allowed, is not looked at. Otherwise
-    `check_steps` checks the times, by the rate and the gap that the description has by then. If it
-    refuses more recordings than 10 % plus one, `time.gap` is set to `?`, with a note on the first.
-    If recordings of another length are stated to be resampled (`traces.lengths`), `traces.samples`
-    becomes the number of samples for which 99 % of the recordings last; longer ones lose their end
-    when they are read. `order` is set to `time` if all recordings start after 1999 (UTC), also if
-    the rate is `?`. If they do not, but no two of them overlap in time, so that one clock runs on
-    through all, and they do not stand in the order of their times, `order` is `?`. Recordings whose
-    times cannot be read are skipped. Raises DataError if a stated format is no form or unit of
-    times, or if a setting in `[time]` is wrong (see `check_forms`).
+    the rate is rounded to five digits. It is `?` (the user must answer), with a note, if it is not
+    between 1 Hz and 1 MHz, like that of times that only fall; then `time.gap`, the longest step
+    that is allowed, is not looked at. Otherwise `check_steps` checks the times, by the rate and the
+    gap that the description has by then. If it refuses more recordings than 10 % plus one,
+    `time.gap` is set to `?`, with a note on the first. If recordings of another length are stated
+    to be resampled (`traces.lengths`), `traces.samples` becomes the number of samples for which
+    99 % of the recordings last; longer ones lose their end when they are read. `order` is set to
+    `time` if all recordings start after 1999 (UTC), also if the rate is `?`. If they do not, but no
+    two of them overlap in time, so that one clock runs on through all, and they do not stand in the
+    order of their times, `order` is `?`. Recordings whose times cannot be read are skipped. Raises
+    DataError if a stated format is no form or unit of times, or if a setting in `[time]` is wrong
+    (see `check_forms`).
     """
     clock = p.description.time
     check_forms(clock, TextForm())  # the marks in numbers may be ? by now

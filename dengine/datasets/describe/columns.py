@@ -20,7 +20,7 @@ from ..read.clock import ISO, times_of
 from ..read.places import ListingReader, listing_table
 from ..read.split import pattern_of, signals_of, word_columns
 from ..table import Cells, Table
-from ..units import bare, is_load, unit_in
+from ..units import bare, unit_in
 
 DAY = "%Y-%m-%d"
 DAYS = (
@@ -145,14 +145,10 @@ class Column:
         """The unit that most files state for the column, or else the one in its name, or "".
 
         It has no brackets. A `.2` (of a name that repeats) or `*` at the end of the name is
-        ignored. In the name of a force only a unit of force or torque counts, or one in brackets:
-        `Force_in` is no length.
+        ignored.
         """
-        stated = mode(bare(table.units.get(self.name, "")) for table in self.tables)
-        unit = unit_in(re.sub(r"\.\d+$|\*$", "", self.name))
-        is_force = any(pattern.search(self.name) for pattern in FORCES)
-        is_word = is_force and not is_load(unit) and self.name[-1] not in "])"
-        return stated or ("" if is_word else unit)
+        unit = mode(bare(table.units.get(self.name, "")) for table in self.tables)
+        return unit or unit_in(re.sub(r"\.\d+$|\*$", "", self.name))
 
     @cached_property
     def forms(self) -> list[str]:

@@ -35,8 +35,8 @@ UNCHECKED = ("", "-", "--", "pending", "open", "offen", "unchecked", "not checke
 YES = ("1", "true", "yes", "ja")
 NO = ("0", "false", "no", "nein")
 VERDICT = (
-    r"(r[eé]sult(s|at)?|verdict|ergebnis|bewertung|outcome|判定|label|success|quality|n?i?ok|nio"
-    r"|pass(ed)?|class|target|y|status|urteil|accept(ed)?|judg?e?ment)"
+    r"(r[eé]sult(s|at)?|verdict|ergebnis|bewertung|outcome|判定|label|success|n?i?ok|nio"
+    r"|pass(ed)?|class|target|y|urteil|accept(ed)?|judg?e?ment)"
 )
 WHOLE = "(total|overall|final|part|teil|gesamt)"
 VERDICT_NAME = re.compile(rf"(?i)(({WHOLE}|test|{VERDICT})[-_ ./]?)?{VERDICT}([-_ .]?{WHOLE})?")
@@ -48,7 +48,7 @@ NEGATED = re.compile(  # or of a name that may be bad, as in `leak=False`
     rf"|(?-i:[-_ .]n)[-_ .](?!i))({WORD})"
     r"|[a-z][-_ .=(/]+(true|false)(?![a-z])"
 )
-ALONE = re.compile(rf"(?i)(?<![^-_ ./(=+\[])({WORD})(?![^-_ ./)\]])")
+ALONE = re.compile(rf"(?i)(?<![^-_ ./(=+\[\d#（])({WORD})(?![^-_ ./)\]）])")  # begins as in PATHS
 PATHS = (  # of verdicts in folders, and at the end or beginning of names
     rf"(?:^|/)({WORD})/",
     rf"[-_ =]({WORD})/",
@@ -290,18 +290,20 @@ def n_contradictions(source: LabelSource, words: Words, other: LabelSource, othe
 
 
 def unmatched(p: Proposal, counted: Iterable[LabelSource]) -> Iterator[str]:
-    """Yield a text on each verdict of a listing of which `counted` has no source.
+    """Yield a text on each listing with a verdict of which `counted` has no source.
 
-    `counted` are the sources of labels for recordings of `p`. A listing is a file with a row for
-    each recording or part, and its verdict a column that is named like one.
+    `counted` are the sources of labels for recordings of `p`; a listing that names half of them or
+    fewer is not among these. A listing is a file with a row for each recording or part, and its
+    verdict a column that is named like one.
     """
     listings = {source.listing for source in counted}
     for source in sources_of(p, ()):
         if source.listing and source.listing not in listings and is_named_like_verdict(source):
+            listings.add(source.listing)
             keys = p.read_listing(source.listing).words(source.key)
             yield (
-                f"{source.listing} has {source.column}, but {source.key} names no recording: "
-                f"{listed(keys[:2])}; if a path contains the key, state part.path"
+                f"{source.listing} has {source.column}, but {source.key} names too few "
+                f"recordings: {listed(keys[:2])}; if a path contains the key, state part.path"
             )
 
 
@@ -340,8 +342,8 @@ def doubt_on(label: LabelSource, counted: Mapping[LabelSource, Words]) -> str:
     for source, others in counted.items():
         if n_odd := n_contradictions(label, words, source, others):
             return f"two of these disagree on {n_odd:,} of {len(words):,} recordings"
-        contradicts = may_contradict(source, others, words, label.meanings)
-        if contradicts and not is_known(source, others.values()):
+        is_open = not is_known(source, others.values())
+        if is_open and may_contradict(source, others, words, label.meanings):
             return "the words of another one may mean good and bad, too, and go another way"
     return ""
 
@@ -375,7 +377,7 @@ def propose_label(p: Proposal) -> None:
     rivals = {tuple(counted[source].items()) for source in (counted if known else named)}
     doubt = "" if named and len(rivals) == 1 else NO_LABEL
     if certain:
-        doubt = doubt_on(certain[0], counted)
+        doubt = doubt_on(certain[0], counted) or next(unmatched(p, counted), "")
     if doubt:
         titles = [*map(title_of, counted, counted.values()), *unmatched(p, counted), doubt]
         p.put("label.column", UNKNOWN, "; ".join(titles))

@@ -4,7 +4,8 @@ import re
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from itertools import zip_longest
+from itertools import groupby, zip_longest
+from operator import itemgetter
 from typing import Any
 
 from ...errors import DataError, listed
@@ -22,7 +23,7 @@ STAMP = re.compile(
     r"|20[0-4]\d[01]\d[0-3]\d[T_ -]?\d{4}(\d\d)?)$"
 )
 YEAR = re.compile(r"20[0-4]\d([01]\d[0-3]\d((\d\d){1,3})?)?")  # with month, day and time of day
-MARK = re.compile(r"[-_. :T/]?")  # between the numbers of a date
+MARK = re.compile(r"[-_. :T/]*")  # between the numbers of a date
 # Numbers of a date with the day or the month first, like 010324 and the time of day.
 DAY_FIRST = re.compile(
     r"[0-3]?\d[0-3]\d(20)?[0-4]\d[0-2]\d[0-5]\d([0-5]\d)?|[0-3]?\d[0-3]\d20[0-4]\d"
@@ -75,12 +76,11 @@ def proves_order(names: Strings) -> bool:
 
     The date is the first number that is a year from 2000 to 2049, or begins with one (20240131), in
     all names, together with the numbers behind it if only marks like `-` or `/` stand between them.
-    If the names first differ in the date, it must be another one in each, and rise: 2024-01-31_1
-    before 2024-01-31_2, but not 2024-01-31/P1_1 before 2024-01-31/P2_1. If they first differ in
-    another number, dates must not fall, and this number must be distinct in each name and rise, and
-    so must any other number that is distinct in each. 31.12.2025 is read with the year first; other
-    numbers with the day first (010324080000), and AM and PM, prove nothing. If all names are equal,
-    no other order is possible.
+    Dates must never fall. If the names first differ in the date, the names of one date must prove
+    their order, too. If they first differ in another number, it must be distinct in each name and
+    rise, and so must any other number that is distinct in each. 31.12.2025 is read with the year
+    first; other numbers with the day first (010324080000), and AM and PM, prove nothing. If all
+    names are equal, no other order is possible.
     """
     if len({*names}) == 1:
         return True
@@ -94,7 +94,8 @@ def proves_order(names: Strings) -> bool:
         return False
     first = next(i for i, row in enumerate(pieces) if len({*row}) > 1)
     if begin <= first <= end:
-        return len({*dates}) == len(names)
+        days = groupby(zip(dates, names, strict=True), itemgetter(0))
+        return all(proves_order([name for _, name in day]) for _, day in days)
     numbers = pieces[1:begin:2] + pieces[end + 2 :: 2]
     counters = [row for row in numbers if "" not in row and len({*row}) == len(names)]
     is_odd = any([*row] != sorted(row) or fits_all(DAY_FIRST, row) for row in counters)
@@ -128,7 +129,7 @@ def is_out_of_order(words: Strings, is_fixed: bool, is_named: bool) -> bool:
     if words == sorted(words) or ranks == sorted(ranks, reverse=True):
         return True
     counts = [rank[-2] for rank in ranks if len(rank) > 1]
-    is_count = len({*counts}) == len(words) > 2
+    is_count = len({*counts}) == len(words) > 2 and not any(n % 1 for n in counts)
     return is_count and max(counts) - min(counts) < 2 * len(words)
 
 

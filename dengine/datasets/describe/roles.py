@@ -21,7 +21,7 @@ from ..read.files import natural_key
 from ..read.recordings import is_dropped, kept_rows
 from ..read.split import match_numbered
 from ..table import Table
-from ..units import is_load, is_unit
+from ..units import QUANTITY, is_load
 from .clock import CLOCK_NAME, COUNTER_NAME, is_clock, propose_clock, propose_rate
 from .columns import FORCES, LOST, MOST_WORDS, Column, Proposal, columns_of, counts_of
 from .labels import VERDICT_NAME, lines_of, part_words, propose_label
@@ -41,7 +41,6 @@ QUALIFIER_NAME = re.compile(
     r"|[ _.](ok|io)$|^qc?$"
 )
 SIGNAL = re.compile(r"(?i)(force|kraft|torque|drehmoment|load|last)([_ ]?[xyz])?")
-FAR = 3  # times the range of all other numbers, from which a repeated number is far outside
 WORD_BEGINS = r"(?i)(^|[^a-z]|(?-i:(?<=[a-z])(?=[A-Z])))"  # also in `forceUnit`
 SCALE_NAME = re.compile(
     WORD_BEGINS + r"(unit(?!.*(serial|id|no|nr|under))|uom|einheit|scale|scaling"
@@ -53,7 +52,6 @@ SET_VALUE = re.compile(
     + r"(set|vorgabe|nominal|target|consigne|max|min|limit|(cmd|des|ref)(?![a-z])|comm?and"
     r"|desired|demand)|soll|grenz"
 )
-WITH_UNIT = re.compile(r"(?i)\d[\d.,]* ?(k?hz|[muµ]?s|s/s|k?n)")
 ANY_NAME = re.compile("")
 
 
@@ -143,9 +141,9 @@ def qualify_rows(p: Proposal) -> None:
             words = tuple(column.counts)
             if len(words) > 1:
                 p.notes[f"rows.{column.name}.keep"] = (
-                    f"which rows are samples? {counts_of(column.odd or column.counts)}; others "
-                    "drop or invalid; * is any other word; if one row has the label, state "
-                    "label.column, and label.at as first or last"
+                    "which rows are samples? all: *, or the words of those to keep; the others are "
+                    f"dropped: {counts_of(column.odd or column.counts)}; lost samples: invalid; if "
+                    "one row has the label, state label.column, and label.at as first or last"
                 )
                 words = (UNKNOWN,)
             rows[column.name] = RowWords(words)
@@ -153,12 +151,12 @@ def qualify_rows(p: Proposal) -> None:
 
 
 def is_status(column: Column) -> bool:
-    """Return whether a column is named like a status or verdict, and has texts, or few numbers.
+    """Return whether a column is named like a status or verdict, and has a text.
 
-    Texts are those for lost values (`LOST`) left out; for numbers see `is_phase`.
+    Those for lost values (`LOST`) are no texts here.
     """
     is_named = QUALIFIER_NAME.search(column.name) or VERDICT_NAME.fullmatch(column.name)
-    return bool(is_named and texts_of(column)) or is_phase(column)
+    return bool(is_named and texts_of(column))
 
 
 def texts_of(column: Column) -> set[str]:
@@ -171,9 +169,9 @@ def may_qualify(column: Column, n_rows: int) -> bool:
 
     It must have a cell in each of the `n_rows` rows of all recordings, or a single one for each
     recording that has the column. It must be a status (`is_status`), or have 1 to 12 different
-    texts, perhaps beside numbers, like `Max` in a footer, and no times. The words must change
-    within a recording, or there must be several words, of which one names a force or a torque; or a
-    column that is named like a status (`Status`, `valid`) has just one word in all.
+    texts, perhaps beside numbers, like `Max` in a footer, and no times, and it must change within a
+    recording. If it does not, there must be several words, of which one names a force or a torque,
+    or it must be named like a status (`Status`, `valid`) and have just one word in all.
     """
     words = column.counts
     is_text = 0 < len(texts_of(column)) <= MOST_WORDS
@@ -181,20 +179,20 @@ def may_qualify(column: Column, n_rows: int) -> bool:
     if words.total() not in (n_rows, len(column.fixed)):
         return False
     if not column.fixed:
-        return is_status(column) or (is_text and not is_time)
+        return is_status(column) or is_phase(column) or (is_text and not is_time)
     if len(words) > 1:
         return any(map(SIGNAL.fullmatch, words))
     return QUALIFIER_NAME.search(column.name) is not None
 
 
 def is_phase(column: Column) -> bool:
-    """Return whether a column has 2 to 12 whole numbers that last for two rows or more on average.
+    """Return whether a column without a unit has 2 to 12 different numbers.
 
-    Each recording has all its cells, and the numbers change within a recording.
+    They differ by whole numbers, no cell is empty or a text, and they change within a recording.
     """
     n = len(column.counts)
     is_whole = 1 < n <= MOST_WORDS and not (column.odd or (column.steps % 1).any())
-    return is_whole and not column.fixed and 2 * column.n_runs <= column.counts.total()
+    return is_whole and not (column.fixed or column.unit)
 
 
 def sources_named(p: Proposal, column: re.Pattern[str], line: re.Pattern[str]) -> list[PartSource]:
@@ -244,15 +242,14 @@ def propose_channels(p: Proposal, units: Mapping[str, str]) -> None:
     """Set `[channels]` in `p` to one column, with its unit; does nothing if channels are stated.
 
     The rules are tried in order, and the first that any column fits decides: a name like a force
-    along z; a name like a force, a unit of force or torque, or a name like `F` or `value`; any
-    column.
-    A name decides only if the unit is that of a force or torque, or unknown. The channels stay
-    empty, with a note, if `units` is empty, if several columns fit the rule, if the column that
-    fits has no unit of force or torque and another column has one, if the column that fits is named
-    like a set value or a limit or stands for numbered columns with a gap, like `x0`, `x1`, `x5`
-    (`_doubt_on`), or if a unit, a factor of scale or a sampling rate that the recordings state
-    differs between them (`_other_scales`). Raises SettingError for a malformed `windows.trigger`
-    (the condition at which a part begins).
+    along z; a name like a force, like `F` or like `value`, or a unit of force or torque; any
+    column. A name decides only if the unit is that of a force or torque, or unknown. The channels
+    stay empty, with a note, if `units` is empty, if several columns fit the rule, if the column
+    that fits has no unit of force or torque and another column has one, if the column that fits is
+    named like a set value or a limit or stands for columns that are not numbered evenly, like `x0`,
+    `x1`, `x5` (`_doubt_on`), or if a unit, a factor of scale or a sampling rate that the recordings
+    state differs between them (`_other_scales`). Raises SettingError for a malformed
+    `windows.trigger` (the condition at which a part begins).
 
     units : the columns that may be channels, with their units, "" for unknown.
     """
@@ -295,23 +292,25 @@ def _other_scales(p: Proposal) -> Iterator[str]:
     """Yield a text for each column or line above the header that shows that scales differ.
 
     It is named like a unit, a factor or a rate, or all its words are units, or numbers with one,
-    and its word is not the same in all recordings. Recordings in which it is missing, empty or
-    changes are ignored. The columns are those without a role (such as channel, clock or label), and
-    the lines are those of the first table. Raises SettingError for a malformed `windows.trigger`.
+    and come again; and its word is not the same in all recordings. Recordings in which it is
+    missing, empty or changes are ignored. The columns are those without a role (such as channel,
+    clock or label), and the lines are those of the first table. Raises SettingError for a malformed
+    `windows.trigger`.
     """
     for source in sources_named(p, ANY_NAME, ANY_NAME):
         name = source.line or source.column[0]
         words = part_words(source, p.tables).values()
-        are_units = all(is_unit(word) or WITH_UNIT.fullmatch(word) for word in words)
-        if len({*words}) > 1 and (are_units or SCALE_NAME.search(name)):
+        n = len({*words})
+        are_units = 2 * n <= len(words) and all(map(QUANTITY.fullmatch, words))
+        if n > 1 and (are_units or SCALE_NAME.search(name)):
             yield f"{name} differs, {counts_of(words)}: convert them first, or state channels"
 
 
 def may_be_channel(column: Column) -> bool:
     """Return whether a column may be a channel, if it has no other use in the description.
 
-    It must have at least three different numbers, change within a recording, and be no times and
-    not named like a counter of rows.
+    It must have at least three different numbers, change within a recording, and be neither times
+    nor a status or phase (`is_status`), nor named like a counter of rows.
     """
     is_other = is_clock(column) or COUNTER_NAME.fullmatch(column.name) or is_status(column)
     return not (is_other or column.fixed) and len(column.counts) - len(column.odd) > 2
@@ -345,16 +344,16 @@ def find_lost(p: Proposal) -> None:
             "text.missing",
             UNKNOWN,
             f"do these mean a lost sample? {counts_of(strange)}; if so state "
-            f"{[*sorted(missing), *strange]}; rows of another signal: rows.COLUMN.drop, and "
-            "channels.COLUMN",
+            f"{[*sorted(missing), *strange]}, else {sorted(missing)}; rows of another signal: "
+            "rows.COLUMN.drop, and channels.COLUMN",
         )
 
 
 def far_outliers(column: Column) -> dict[str, int]:
     """Return how often each word comes that is a number far outside all others, like -9999.
 
-    It comes twice or more, and lies below or above the others by more than three times their range,
-    the other such numbers left out. These are marks for lost samples or for overflow.
+    It comes twice or more, and lies below or above the others by more than their range, the other
+    such numbers left out. These are marks for lost samples or for overflow.
     """
     words = np.array([word for word in column.counts if word not in column.odd], dtype=object)
     found = dict[str, int]()
@@ -366,9 +365,10 @@ def far_outliers(column: Column) -> dict[str, int]:
             last = 0 if steps[0] > steps[-1] else -1
             word = words[order[last]]
             order = np.delete(order, last)
-            if column.counts[word] < 2 or steps[last] <= FAR * np.ptp(numbers[order]):
+            if steps[last] <= np.ptp(numbers[order]):
                 break
-            found[word] = column.counts[word]
+            if column.counts[word] > 1:  # once: a peak, behind which marks may lie
+                found[word] = column.counts[word]
     return found
 
 

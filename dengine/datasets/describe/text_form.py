@@ -144,7 +144,7 @@ def _first_row(rows: Rows, width: int) -> int:
     counts as 0. The first of four successive rows with enough numbers, or of fewer at the end, is
     the first row of samples. Rows directly above belong to the samples, too, if they have `width`
     cells and their first cell differs only by a number and is not empty: `0.0,,` above `0.1,5,` (a
-    lost sample), but not `time,force,`. If the row found has 20 or more numbers that increase
+    lost sample), but not `time,force,`. If the row found has 20 or more numbers that rise evenly
     (`is_numbering`), and the row below it does not, it names columns, and the row below is the
     first.
     """
@@ -217,13 +217,12 @@ def propose_form(p: Proposal, contents: Mapping[str, bytes], faults: Faults) -> 
     `p` is the description so far, and `[text]` its section on how text files are written. Files
     with another delimiter, number of columns or header are left out: they move from `p.names` to
     `p.others`. If there are two or more of them, or the name of a single one differs by a number
-    only from that of a file in the result, `exclude` (the patterns of
-    files that are no recordings) is set to `?` (the user must answer), with a note that asks
-    whether they are recordings. For a file that is no text, or whose header is not certain, a fault
-    (why it cannot be read) is appended to `faults`, and it stays in `p.names`; if all are such,
-    nothing is set, and the result is empty. Of equally frequent forms that of the file with the
-    most cells counts. Keys that the user stated stay. Raises LookupError for a stated encoding that
-    Python does not know.
+    only from that of a file in the result, `exclude` (the patterns of files that are no recordings)
+    is set to `?` (the user must answer), with a note that asks whether they are recordings. For a
+    file that is no text, or whose header is not certain, a fault (why it cannot be read) is
+    appended to `faults`, and it stays in `p.names`; if all are such, nothing is set, and the result
+    is empty. Of equally frequent forms that of the file with the most cells counts. Keys that the
+    user stated stay. Raises LookupError for a stated encoding that Python does not know.
 
     contents : the contents of the files that are looked at, by name.
     """
@@ -238,8 +237,10 @@ def propose_form(p: Proposal, contents: Mapping[str, bytes], faults: Faults) -> 
     odd = [name for name, form in forms.items() if form != usual]
     p.set_aside(odd)
     alike = {DIGITS.sub("0", name) for name in odd} & {DIGITS.sub("0", name) for name in same}
-    if len(odd) > 1 or alike:
+    if len({forms[name] for name in odd}) < len(odd) or alike:
         p.put("exclude", UNKNOWN, f"are {listed(odd)} recordings of another form? See files")
+    if 2 * len(looks) < len(contents):
+        return []
     if same:
         _propose_keys(p, [looks[name] for name in same])
     return same
@@ -287,7 +288,7 @@ def _column_names(usual: Look) -> Strings:
     usual : how a typical file is written, and the cells of its samples.
     """
     width = usual.width
-    cells = split_line(COMMENT.sub("", usual.line.lstrip()), usual.form.delimiter)
+    cells = split_line(COMMENT.sub("", usual.line.lstrip(BLANK)), usual.form.delimiter)
     if len(cells) == width:
         return []
     is_closed = not any(row[-1] for row in usual.rows if len(row) == width)
@@ -322,7 +323,7 @@ def propose_marks(p: Proposal, cells: Collection[str]) -> None:
     marks, groups = zip(*(key for key, n in n_read.items() if n == most), strict=True)
     p.put("text.decimal", marks[0])
     p.put("text.thousands", groups[0])
-    is_both = any({*".,"} <= {*cell} for cell in cells)
+    is_both = all({*".,"} <= {*cell} for cell in cells if groups[0] in cell)
     if groups[0] in (".", ",") and not is_both:
         p.put("text.thousands", UNKNOWN, "'.' or ',', or '' if there is none")
     marked = [cell for cell in cells if {*cell}.intersection(".,")]

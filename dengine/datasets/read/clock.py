@@ -8,6 +8,7 @@ from ...errors import DataError, instead
 from ...records import Floats
 from ..description import Clock, TextForm
 from ..table import Table, UnreadableError
+from ..units import bare
 
 UNITS = {"s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9}
 UNITS |= {"min": 60.0, "h": 3600.0, "d": 86400.0}
@@ -97,7 +98,8 @@ def times_of(table: Table, clock: Clock, form: TextForm) -> Floats:
             values = _dates(table, name, unit, clock)
             period = 0.0 if any(map(has_day, (unit, *clock.format))) else DAY
         else:
-            scale = scale_of(unit)
+            own = bare(table.units.get(name, ""))  # in the file's row of units
+            scale = scale_of(own if own in UNITS else unit)
             values = table.numbers(name, form) * scale
             table.refuse(np.isnan(values), "a time", name)
             period = clock.wrap * scale

@@ -7,6 +7,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from operator import eq
 from pathlib import Path
 
 from ...errors import DataError, instead, listed, shortened
@@ -167,14 +168,14 @@ def in_listing(name: str) -> Iterator[None]:
 class LabelReader:
     """Finds the label of a recording in one source.
 
-    listing : the different words by key, if the source is a listing. is_short : whether keys are
-    compared in their short form (`as_key`), since no two of the listing are the same then. used :
-    the keys that were found, each with the path of the first recording that has it.
+    listing : the different words by key, if the source is a listing. files : its keys by the file
+    name in them (`folders_of`). used : the keys that were found, each with the path of the first
+    recording that has it.
     """
 
     source: LabelSource
     listing: Mapping[str, set[str]]
-    is_short: bool
+    files: Mapping[str, list[str]]
     used: dict[str, str] = field(default_factory=dict)
 
     def word(self, table: Table, part: str) -> str:
@@ -184,8 +185,10 @@ class LabelReader:
         listing (a file with a row for each recording or part), it is the word of all its rows with
         the key of the recording. The key is the first of these that is listed: the number of the
         part, the path, the file name, the path without suffix, the file name without suffix; they
-        are compared as `as_key` writes them, so 0012 is 12. A word is "" if its cell is empty. The
-        key is added to `used`, the keys found so far.
+        are compared as `as_key` writes them, so 0012 is 12. Otherwise it is the only one with the
+        same file and, as far as both have them, the same folders (`folders_of`), like
+        `D:/Data/P7.tdms` for `P007.csv`. A word is "" if its cell is empty. The key is added to
+        `used`, the keys found so far.
 
         Raises
         ------
@@ -203,15 +206,19 @@ class LabelReader:
             return words_of(source, table, [source.column or source.topic], source.at)[0]
         name = path.rpartition("/")[2]
         names = filter(None, (part, path, name, without_suffix(path), without_suffix(name)))
-        keys = [as_key(name, self.is_short) for name in names]
-        keys = [key for key in keys if key in self.listing]
+        keys = [key for key in map(as_key, names) if key in self.listing]
+        folders = folders_of(path)
+        alike = self.files.get(folders[0], ())
+        alike = [key for key in alike if all(map(eq, folders, folders_of(key)))]
+        if len(alike) == 1:
+            keys += alike
         if not keys:
             raise UnreadableError(
                 f"Expected {part or name} in {source.listing}, it is not listed; it has "
                 f"{listed(sorted(self.listing)[:2])}; if its name contains the key, state part.path"
             )
         key = keys[0]
-        if self.used.setdefault(key, path) != path and key != as_key(part, self.is_short):
+        if self.used.setdefault(key, path) != path and key != as_key(part):
             raise UnreadableError(
                 f"Expected one file for {key} in {source.listing}, got {self.used[key]} before"
             )
@@ -260,18 +267,24 @@ class LabelReader:
         )
 
 
-def as_key(word: str, is_short: bool) -> str:
-    r"""Return a word as a key of a listing, so that keys are equal if they mean the same.
+def as_key(word: str) -> str:
+    """Return a word as a key of a listing, so that keys are equal if they mean the same.
 
-    A whole number loses its leading zeros, and a fraction `.0`; a backslash becomes `/`, and
-    letters become small. `="0012"`, like Excel writes a text, is the number 0012, and becomes `12`.
-    A short key has no folder, no suffix of a file, and no leading zeros of any number in it:
-    `C:\Data\P007.tdms` becomes `p7`.
+    A whole number, also one like `12.0`, loses its leading zeros, letters become small, and a
+    backslash becomes `/`. `="0012"`, like Excel writes a text, is the number 0012, and becomes
+    `12`.
     """
     word = word.removeprefix("=").strip('"').replace("\\", "/").lower()
-    word = re.sub(r"^0*(\d+)(\.0+)?$", r"\1", word)
-    name = without_suffix(word.rpartition("/")[2])
-    return re.sub(r"(?<!\d)0+(?=\d)", "", name) if is_short else word
+    return re.sub(r"^0*(\d+)(\.0+)?$", r"\1", word)
+
+
+def folders_of(path: str) -> list[str]:
+    """Return the file name of a path, then its folders from the inside out, to be compared.
+
+    The suffix of the file, capital letters and the leading zeros of numbers are left out.
+    """
+    plain = re.sub(r"(?<!\d)0+(?=\d)", "", as_key(without_suffix(path)))
+    return plain.removeprefix("./").split("/")[::-1]
 
 
 def read_labels(source: LabelSource, read_listing: ListingReader) -> LabelReader:
@@ -285,15 +298,15 @@ def read_labels(source: LabelSource, read_listing: ListingReader) -> LabelReader
     here.
     """
     listing = defaultdict[str, set[str]](set)
-    is_short = False
     if source.listing:
         columns = (source.key, source.column)
         if not all(columns):
             raise DataError("Expected label.key and label.column, two columns of label.listing.")
         with in_listing(source.listing):
             table = read_listing(source.listing)
-            keys, words = map(table.words, columns)
-            is_short = len({as_key(key, True) for key in keys}) == len({*keys})
-            for key, word in zip(keys, words, strict=True):
-                listing[as_key(key, is_short)].add(word)
-    return LabelReader(source, listing, is_short)
+            for key, word in zip(*map(table.words, columns), strict=True):
+                listing[as_key(key)].add(word)
+    files = defaultdict[str, list[str]](list)
+    for key in listing:
+        files[folders_of(key)[0]].append(key)
+    return LabelReader(source, listing, files)

@@ -356,13 +356,13 @@ def fitted(samples: Floats, seconds: Floats | None, description: Description) ->
     """Return the trace (C, T) of samples (C, n), brought to T samples as `[traces]` says.
 
     This section of the description has T, `samples`, and what happens to another length, `lengths`.
-    `seconds`, shape (n,), has the times of the samples; None without a clock. With `resample`
-    and times, the samples are interpolated at the stated rate from the first time on. A longer
+    `seconds`, shape (n,), has the times of the samples; None without a clock. With `resample` and
+    times, the samples are interpolated at the stated rate from the first time on. A longer
     recording loses its end; one that ends up to one step early is accepted, and its last sample
-    repeated. Otherwise it is fitted like a live trace
-    (`can_fit_length`, `fit_length`): `strict` takes only T samples, `cut` drops the end, `pad`
-    drops the end or repeats the last sample, and `resample` interpolates evenly, both if there are
-    half to twice T samples. `pad-all` is like `pad`, but takes any length but 0.
+    repeated. Otherwise it is fitted like a live trace (`can_fit_length`, `fit_length`): `strict`
+    takes only T samples, `cut` drops the end, `pad` drops the end or repeats the last sample, and
+    `resample` interpolates evenly, both if there are half to twice T samples. `pad-all` is like
+    `pad`, but takes any length but 0.
 
     Raises
     ------
