@@ -163,7 +163,7 @@ def read_archive(
         }
         wanted = [key for key in sizes if names is None or key in names]
         check_size(sum(sizes[key] for key in wanted), title)
-        return {key: np.asarray(archive[key]) for key in wanted}, list(sizes)
+        return {key: archive[key] for key in wanted}, list(sizes)
 
 
 def is_database(path: Path) -> bool:
@@ -214,8 +214,10 @@ def check_output(path: FilePath, force: bool = False) -> None:
         except FileNotFoundError:
             return
         if not stat.S_ISREG(mode):
-            kind = SPECIAL_FILES.get(stat.S_IFMT(mode), "device")
-            raise OutputError(f"Expected a file to write, {target} is a {kind}; name another one.")
+            raise OutputError(
+                f"Expected a file to write, {target} is a "
+                f"{SPECIAL_FILES.get(stat.S_IFMT(mode), 'device')}; name another one."
+            )
         unchanged = "was left as it was; name another file"
         if is_database(target):
             raise OutputError(f"{target} is a database, as a store is, and {unchanged}.")

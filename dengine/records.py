@@ -33,8 +33,9 @@ def is_whole(value: Any, least: int, most: int) -> bool:
 
     Both ends are included. True, False and floats such as 1.0 are no integers here.
     """
-    is_integer = isinstance(value, Integral) and not isinstance(value, bool)
-    return is_integer and least <= int(value) <= most
+    return (
+        isinstance(value, Integral) and not isinstance(value, bool) and least <= int(value) <= most
+    )
 
 
 def is_number(value: Any) -> bool:

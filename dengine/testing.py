@@ -74,11 +74,11 @@ def toy_traces(
     """
     rng = np.random.default_rng(seed)
     y = (rng.random(n) >= failures).astype(np.int64)
-    t = np.linspace(0.0, 1.0, samples)[None, None, :]
+    t = np.linspace(0.0, 1.0, samples)
     onset = np.where(y == 1, 0.7, 0.35)[:, None, None] + rng.normal(0.0, 0.03, (n, 1, 1))
     height = rng.normal(20.0, 2.0, (n, channels, 1))
     X = height / (1.0 + np.exp(-40.0 * (t - onset)))
-    X = X + rng.normal(0.0, noise, (n, channels, samples))
+    X += rng.normal(0.0, noise, (n, channels, samples))
     return X.astype(np.float32), y
 
 

@@ -129,15 +129,13 @@ def _print_open_keys(source: DataChoice, description: "Description", path: Path 
     path : Path or None
         The file to which the description was written, which is printed; None: nothing was written.
     """
-    notes = description.notes
-    questions = [f"- {key}: {notes.get(key, 'not known')}" for key in description.open_keys]
     text = description.to_toml()
     print_result(
         {"data": source.data, "description": text, "open": description.open_keys},
         text,
         f"Wrote {path}." if path else "",
         "Still open, so nothing was read; state each with --set KEY=VALUE:",
-        *questions,
+        *(f"- {key}: {description.notes.get(key, 'not known')}" for key in description.open_keys),
     )
 
 

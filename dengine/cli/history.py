@@ -316,5 +316,8 @@ def _explanation_rows(explanation: Explanation) -> Iterator[tuple[str, str]]:
     if envelope is None:
         yield "envelope", "too few successes of this shape are known yet"
         return
-    outside = percent(envelope.outside, ".0f")
-    yield "envelope", f"{outside} of its samples leave the band of {envelope.n:,} successes"
+    yield (
+        "envelope",
+        f"{percent(envelope.outside, '.0f')} of its samples leave the band of {envelope.n:,} "
+        "successes",
+    )

@@ -300,8 +300,10 @@ def format_value(name: str, value: Any) -> str:
         return ", ".join(counts) or "none"
     if isinstance(value, list | tuple):
         titles = TUPLE_TITLES.get(name, ("",) * len(value))
-        pairs = zip(titles, value, strict=True)
-        return ", ".join(f"{title} {format_value(name, item)}".strip() for title, item in pairs)
+        return ", ".join(
+            f"{title} {format_value(name, item)}".strip()
+            for title, item in zip(titles, value, strict=True)
+        )
     if isinstance(value, bool):
         return "yes" if value else "no"
     if math.isnan(value):
@@ -364,8 +366,9 @@ def certificate_record(certificate: "Certificate") -> Record:
     It has all its fields, `kept` (whether the bound on accepted parts lies within the tolerance),
     and its sentences on accepted and on rejected parts, `sentence` and `sentence_on_rejects`.
     """
-    sentences = ("kept", "sentence", "sentence_on_rejects")
-    return asdict(certificate) | {name: getattr(certificate, name) for name in sentences}
+    return asdict(certificate) | {
+        name: getattr(certificate, name) for name in ("kept", "sentence", "sentence_on_rejects")
+    }
 
 
 @contextmanager
@@ -428,8 +431,9 @@ def _progress_lines(label: str, total: int | None) -> Iterator[Advance]:
         begin = time.monotonic()
         while not ended.wait(LINE_SECONDS):
             seconds = format_duration(time.monotonic() - begin)
-            text = f"{label}: {n_steps:,} of {total or '?'} in {seconds}"
-            click.echo(without_password(text), err=True)
+            click.echo(
+                without_password(f"{label}: {n_steps:,} of {total or '?'} in {seconds}"), err=True
+            )
 
     Thread(target=write_lines, daemon=True).start()
     try:

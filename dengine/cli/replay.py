@@ -574,8 +574,10 @@ def costs(
         record["python"] = f"Policy({', '.join(f'{k}={v!r}' for k, v in settings.items())})"
         store = source.data if source.data.endswith(".db") else "cell.db"
         # What is not given stays as it is in the store.
-        names = "guarantee", "alpha", "audit_rate", "stops"
-        kept = {name: getattr(curve.policy, name) for name in names}
+        kept = {
+            name: getattr(curve.policy, name)
+            for name in ("guarantee", "alpha", "audit_rate", "stops")
+        }
         record["command"] = f"dengine policy {store} {_as_flags(settings | kept)}"
         command = " \\\n    ".join(wrap(record["command"], 72, break_on_hyphens=False))
         lines.append(f"Set it by\n  {command}\n  {record['python']}")

@@ -232,8 +232,10 @@ def _simulated_cell(scenario: str, cycles: int, source: DataChoice, **others: An
         if store.product is not None:
             # The cells of one product have one seed, but each makes other parts.
             seed += crc32(store.cell_id.encode())
-        cell = SimulatedCell(scenario=scenario, seed=seed, cycles=cycles)
-        return cell, f"simulated cell, {scenario}"
+        return (
+            SimulatedCell(scenario=scenario, seed=seed, cycles=cycles),
+            f"simulated cell, {scenario}",
+        )
 
     stated = options.trace_spec_from(source.options)
     spec = SimulatedCell.spec if stated is None else stated.completed(SimulatedCell.spec)
@@ -280,8 +282,10 @@ def _replay_cell(source: DataChoice, cycles: int, **others: Any) -> CellToDrive:
             cycles,
             f"{first} of {len(dataset)} parts were played before",
         )
-        cell = ReplayCell(dataset, np.arange(first, len(dataset)))
-        return cell, f"recording {dataset.name} from part {first + 1}"
+        return (
+            ReplayCell(dataset, np.arange(first, len(dataset))),
+            f"recording {dataset.name} from part {first + 1}",
+        )
 
     return dataset.spec, make
 

@@ -197,7 +197,6 @@ def _error_cell(estimate: "ErrorEstimate") -> str:
     basis = ""
     if estimate.n_known:
         basis = f"{estimate.n_wrong:,} of {estimate.n_known:,} by {estimate.basis}: "
-    ends = outward(100 * estimate.lower, 100 * estimate.upper, 1)
-    interval = "{:.1f} to {:.1f} %".format(*ends)
+    interval = "{:.1f} to {:.1f} %".format(*outward(100 * estimate.lower, 100 * estimate.upper, 1))
     verdict = f"{VERDICTS[estimate.verdict]} {percent(estimate.tolerance, 'g')}"
     return f"{basis}{interval}, {verdict}"

@@ -378,8 +378,7 @@ def _verification_lines(report: HistoryReport) -> Iterator[str]:
             )
     for fault in report.faults[:MOST_FAULTS]:
         cell_text = fault.cell_id and f"cell {fault.cell_id}:"
-        where = " ".join(filter(None, (cell_text, fault.table, fault.key)))
-        yield f"{where} {fault.problem}."
+        yield " ".join(filter(None, (cell_text, fault.table, fault.key, f"{fault.problem}.")))
     if len(report.faults) > MOST_FAULTS:
         yield f"And {len(report.faults) - MOST_FAULTS} more; --json shows all."
     if report.ok:

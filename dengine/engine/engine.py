@@ -787,8 +787,9 @@ class DataEngine(AbstractContextManager["DataEngine"]):
             except NotTakenError as error:
                 # The label waits for the disk, and every part is verified until that is well.
                 log.warning("the label of %s: %s", decision.id, error)
-        retrain = self.poll()
-        return Cycle(index, decision, outcome, success, source, seconds, retrain, self.safe_mode)
+        return Cycle(
+            index, decision, outcome, success, source, seconds, self.poll(), self.safe_mode
+        )
 
     # Learning
 

@@ -274,10 +274,12 @@ class Feedback:
         trace came before its outcome.
         """
         decision = stored.decision
-        if decision.action is not Action.ACCEPT or self._stops_all:
-            return False
-        is_of_policy = decision.model_version >= self._settings.now.policy_since
-        return decision.id not in self._unreported and is_of_policy
+        return (
+            decision.action is Action.ACCEPT
+            and not self._stops_all
+            and decision.model_version >= self._settings.now.policy_since
+            and decision.id not in self._unreported
+        )
 
     def number_labels(self) -> None:
         """In a product, give this cell's references the numbers that the store gave their labels.

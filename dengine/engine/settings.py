@@ -337,8 +337,10 @@ def _with_objects(
         or reducer_class(recipe.name) is not type(reducer)
         or Recipe(make_reducer(recipe.name, **recipe.params)).to_toml() != Recipe(reducer).to_toml()
     ):
-        got = describe_estimator(reducer)
-        raise SettingError(f"Expected reducer {recipe.name} of {name}, got {got}; leave it out.")
+        raise SettingError(
+            f"Expected reducer {recipe.name} of {name}, got {describe_estimator(reducer)}; "
+            "leave it out."
+        )
     return recipe
 
 

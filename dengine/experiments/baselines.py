@@ -330,8 +330,9 @@ def make_baseline(name: str, policy: Policy, seed: int = 0, **params: Any) -> Ba
     kind = baseline_class(name)
     names = [item.name for item in fields(kind) if item.kw_only]
     if unknown := ", ".join(sorted(params.keys() - names)):
-        parameters = ", ".join(names) or "none"
-        raise SettingError(f"The baseline {name} has no parameter {unknown}; it has {parameters}.")
+        raise SettingError(
+            f"The baseline {name} has no parameter {unknown}; it has {', '.join(names) or 'none'}."
+        )
     return kind(policy, seed, **params)
 
 

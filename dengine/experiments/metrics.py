@@ -151,8 +151,11 @@ class Costs:
     def __post_init__(self) -> None:
         for field in fields(self):
             value = getattr(self, field.name)
-            is_cost = is_number(value) and 0.0 <= value < math.inf
-            expect(is_cost, f"a finite cost of 0 or more as {field.name}", value)
+            expect(
+                is_number(value) and 0.0 <= value < math.inf,
+                f"a finite cost of 0 or more as {field.name}",
+                value,
+            )
         expect(
             self.check > 0.0,
             "a check that costs something",
@@ -185,8 +188,9 @@ class Costs:
         saved : float
             In the unit of the costs; negative if the errors cost more than the checks.
         """
-        checks = self.check * certain
-        return checks - self.escape * false_positive - self.false_reject * false_negative
+        return (
+            self.check * certain - self.escape * false_positive - self.false_reject * false_negative
+        )
 
     def of_part(self, accepted: float, rejected: float, bad: float, good: float) -> float:
         """Return the mean cost of a part if the model accepts and rejects these shares of parts.

@@ -468,8 +468,7 @@ def _positions(decisions: list[Decision]) -> Floats:
     ]
     width = next((len(mean) for mean in reversed(means) if len(mean)), 2)
     unknown = np.full(width, np.nan)
-    positions = [mean if len(mean) == width else unknown for mean in means]
-    return np.array(positions).reshape(len(means), width)
+    return np.array([mean if len(mean) == width else unknown for mean in means]).reshape(-1, width)
 
 
 def watch(

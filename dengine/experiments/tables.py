@@ -172,8 +172,10 @@ def pooled_table(rows: Sequence[Row], title: str, legend: str) -> Table:
         name = f"{row['recipe']}\n{row['guarantee']}, {row['stops']}"
         if several_intervals:
             name += f"\n{row['interval']}"
-        cells = {column: format_cell(row) for column, format_cell in CELLS.items()}
-        shown.append({"recipe\nguarantee": name} | cells)
+        shown.append(
+            {"recipe\nguarantee": name}
+            | {column: format_cell(row) for column, format_cell in CELLS.items()}
+        )
     return table_of_numbers(title, shown, legend)
 
 

@@ -405,8 +405,10 @@ def status(store: SqlStore, last: int = NEWEST, watching: bool = False) -> Statu
     outcomes = tally.outcomes
     events = store.events.newest()
     losses = [event.text for event in open_losses(events)]
-    modes = (SAFE_MODE_BEGAN, SAFE_MODE_ENDED)
-    mode = next((event for event in reversed(events) if event.kind in modes), None)
+    mode = next(
+        (item for item in reversed(events) if item.kind in (SAFE_MODE_BEGAN, SAFE_MODE_ENDED)),
+        None,
+    )
     began = mode if mode is not None and mode.kind == SAFE_MODE_BEGAN else None
     retrains = store.versions.all(cell_only=True)
     last_seq = retrains[-1].last_seq if retrains else 0

@@ -898,8 +898,10 @@ class ModelPrediction(EngineModel):
                 restored = as_reducer(clone(self.reducer), self.folds).set_state(state)
         except StoreError:  # of the test trace, whose points `set_state` compares
             return NOT_RESTORED
-        answers = (restored.embed(self.examples) for _ in range(N_CHECKS))
-        return "" if all(is_close(z, points, SAME_BATCH) for z in answers) else NOT_RESTORED
+        is_restored = all(
+            is_close(restored.embed(self.examples), points, SAME_BATCH) for _ in range(N_CHECKS)
+        )
+        return "" if is_restored else NOT_RESTORED
 
     def check_answers(self) -> str:
         """Compare the decider's embeddings of `examples` with the points that `defect` kept.

@@ -202,8 +202,7 @@ def as_samples(value: Any, channels: int = 1) -> TraceArray:
     else:
         try:
             with np.errstate(over="ignore"):
-                wide = np.array(msgspec.convert(value, Samples), dtype=np.float64)
-                samples = wide.astype(np.float32)
+                samples = np.array(msgspec.convert(value, Samples), np.float64).astype(np.float32)
         except (ValueError, OverflowError) as error:
             raise TraceError(
                 "Expected numbers in a list, or a list of such lists of one length for channels."
@@ -431,9 +430,8 @@ def problem_response(
     ValueError for a status that HTTP does not know.
     """
     retry = {"Retry-After": str(RETRY_SECONDS)} if status == 503 else {}
-    line = " ".join(without_password(detail).split())
     return json_response(
-        Problem(HTTPStatus(status).phrase, status, line),
+        Problem(HTTPStatus(status).phrase, status, " ".join(without_password(detail).split())),
         status,
         retry | dict(headers or {}),
         PROBLEM,
@@ -451,8 +449,9 @@ def _error_response(request: Request, error: Any) -> Response:
     logged with its traceback.
     """
     if isinstance(error, HTTPException):
-        detail = NO_ROUTE.get(error.status_code, error.detail)
-        return problem_response(error.status_code, detail, error.headers)
+        return problem_response(
+            error.status_code, NO_ROUTE.get(error.status_code, error.detail), error.headers
+        )
     for error_type, status in STATUSES.items():
         if isinstance(error, error_type):
             return problem_response(status, as_options(str(error)))

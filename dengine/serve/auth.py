@@ -84,8 +84,8 @@ def read_tokens(file: Path) -> Tokens:
     # From version 254 on, systemd gives a credential to the service's user by an ACL, which shows
     # as a permission of the group.
     is_credential = file.absolute().parent == Path(os.environ.get("CREDENTIALS_DIRECTORY", ""))
-    has_owners = hasattr(os, "getuid")  # on Windows the mode does not say who may read
-    if has_owners and mode & (0o037 if is_credential else 0o077):
+    # On Windows the mode does not say who may read.
+    if hasattr(os, "getuid") and mode & (0o037 if is_credential else 0o077):
         raise SettingError(
             f"Expected a token file that only its owner may use, {file} has mode {mode:o}; "
             f"run: chmod 600 {file}"

@@ -74,8 +74,10 @@ class LineFormatter(logging.Formatter):
         small letters, and the text, with a traceback if there is one, as a JSON string.
         """
         text = json.dumps(without_password(super().format(record)))
-        time = self.formatTime(record)
-        return f"{time} level={record.levelname.lower()} logger={record.name} message={text}"
+        return (
+            f"{self.formatTime(record)} level={record.levelname.lower()} logger={record.name} "
+            f"message={text}"
+        )
 
 
 def log_lines() -> None:

@@ -110,5 +110,6 @@ def fault(code: int, text: str) -> bytes:
 
     Its text is put on one printable line and cut to 300 characters (`one_line`).
     """
-    error = xmlrpc.client.Fault(code, one_line(text))
-    return xmlrpc.client.dumps(error, methodresponse=True).encode("utf-8", "replace")
+    return xmlrpc.client.dumps(
+        xmlrpc.client.Fault(code, one_line(text)), methodresponse=True
+    ).encode("utf-8", "replace")

@@ -566,7 +566,7 @@ class Database:
         that is raised names that engine.
         """
         digest = hashlib.sha256(b"dengine " + self.cell_id.encode()).digest()
-        key = int.from_bytes(digest[:8], "big", signed=True)
+        key = int.from_bytes(digest[:8], signed=True)
         taken = connection.execute("SELECT pg_try_advisory_lock(%s)", [key]).fetchone()[0]
         holder_query = (
             "SELECT a.application_name FROM pg_locks l JOIN pg_stat_activity a USING (pid) WHERE "

@@ -122,8 +122,7 @@ class RecordInsertion:
             for label in new.values()
         ]
         numbers = {id_: row.seq for id_, row in stored.items()}
-        new_numbers = self._database.insert(connection, LABEL.c.seq, rows)
-        numbers |= zip(new, new_numbers, strict=True)
+        numbers |= zip(new, self._database.insert(connection, LABEL.c.seq, rows), strict=True)
         self._insert_events(connection, events, problems)
         for id_ in late_stops:
             event = new_event(
@@ -158,8 +157,11 @@ class RecordInsertion:
             if row is None:
                 new.append(item)
                 continue
-            given = decision_row(item) | trace_row(item)
-            different = [name for name, value in given.items() if row._mapping[name] != value]
+            different = [
+                name
+                for name, value in (decision_row(item) | trace_row(item)).items()
+                if row._mapping[name] != value
+            ]
             if different:
                 problems.append(
                     f"{_describe(item)}, of which the store holds another: "
@@ -167,8 +169,10 @@ class RecordInsertion:
                 )
         self._database.insert(connection, DECISION.c.number, [decision_row(item) for item in new])
         if new:
-            cell = {"cell_id": self._database.cell_id}
-            connection.execute(sa.insert(TRACE), [cell | trace_row(item) for item in new])
+            connection.execute(
+                sa.insert(TRACE),
+                [{"cell_id": self._database.cell_id} | trace_row(item) for item in new],
+            )
         return problems
 
     def _insert_events(

@@ -259,8 +259,10 @@ class Journal:
 
         A failure is ignored: after a power failure the head is then older than the journal.
         """
-        head = head_path(self.path)
-        with suppress(OSError), os.fdopen(open_plain(head, os.O_WRONLY), "wb") as file:
+        with (
+            suppress(OSError),
+            os.fdopen(open_plain(head_path(self.path), os.O_WRONLY), "wb") as file,
+        ):
             sync(file.fileno())
 
     def is_intact(self, offset: int) -> bool:
@@ -341,10 +343,11 @@ class Journal:
         if need be. A failure is ignored: an older head is harmless. The caller holds the lock
         `_describing`.
         """
-        with suppress(OSError):
-            descriptor = open_plain(head_path(self.path), os.O_WRONLY | os.O_CREAT)
-            with os.fdopen(descriptor, "wb") as file:
-                file.write(_pack_fields(vars(self.head)).ljust(HEADER))
+        with (
+            suppress(OSError),
+            os.fdopen(open_plain(head_path(self.path), os.O_WRONLY | os.O_CREAT), "wb") as file,
+        ):
+            file.write(_pack_fields(vars(self.head)).ljust(HEADER))
 
     def clear(self) -> None:
         """Remove all records; the caller has made sure that the store holds them.

@@ -393,8 +393,9 @@ def find_integrity_error(connection: sa.Connection, cell_id: str, key: bytes, fi
         .limit(2)
     )
     newest, before = [*(row._asdict() for row in rows), {}, {}][:2]
-    previous = before.get("digest", START)
-    if newest and entry_digest(previous, newest | {"digest": None}, key) != newest["digest"]:
+    if newest and newest["digest"] != entry_digest(
+        before.get("digest", START), newest | {"digest": None}, key
+    ):
         return "the newest entry of the ledger is not as it was written"
     chains = parse_object(newest.get("chains"))
     settings = _settings_chain(_settings_text(connection, cell_id))
@@ -449,7 +450,7 @@ def _find_table_error(
             LEDGER.c.cell_id == cell_id, LEDGER.c.number == before.entry
         )
         chain = parse_object(connection.execute(query).scalar()).get(name, "")
-        selected = selected & (number > before[1])
+        selected &= number > before[1]
     selected &= entry.is_(None) | (entry <= last_entry)
     rows = connection.execute(
         sa.select(*(column for column in table.c if column.name != "state"))

@@ -99,8 +99,9 @@ def _embedding_settings(settings: Settings) -> dict[str, Any]:
     None; the recipe must be. Raise SettingError for a recipe that cannot be read.
     """
     recipe = Recipe.from_toml(settings["recipe"])
-    of_recipe = {key: getattr(recipe, key) for key in EMBEDDING}
-    return of_recipe | {key: settings.get(key) for key in ("seed", "trace", "model", "described")}
+    return {key: getattr(recipe, key) for key in EMBEDDING} | {
+        key: settings.get(key) for key in ("seed", "trace", "model", "described")
+    }
 
 
 def check_cell_exists(url: str, cell_id: str) -> None:
@@ -131,8 +132,10 @@ def list_cells(url: str) -> list[CellSummary]:
     with reading(url) as connection:
         settings = connection.execute(sa.select(SETTING)).all()
         products = {row.cell_id: row.value for row in settings if row.key == PRODUCT_KEY}
-        names = sorted({row.cell_id for row in settings})
-        return [_summarize(connection, Scope(name, products.get(name))) for name in names]
+        return [
+            _summarize(connection, Scope(name, products.get(name)))
+            for name in sorted({row.cell_id for row in settings})
+        ]
 
 
 def _summarize(connection: sa.Connection, cell: Scope) -> CellSummary:

@@ -227,8 +227,10 @@ def audit_columns() -> tuple[sa.ColumnElement[int], sa.ColumnElement[float]]:
     probability = sa.case(
         (DECISION.c.action == Action.VERIFY.value, DECISION.c.propensity), else_=0.0
     )
-    predicted = sa.case(positions, value=DECISION.c.predicted)
-    return predicted.label("predicted"), probability.label("inclusion_probability")
+    return (
+        sa.case(positions, value=DECISION.c.predicted).label("predicted"),
+        probability.label("inclusion_probability"),
+    )
 
 
 # The label after corrections: 0 or 1; NULL if there is none, or it was forgotten.

@@ -93,7 +93,6 @@ def read_rule_progress(
     # 0: a peer's, which knows nothing of this cell
     last_seq = int(state.get("rule_last_seq", version.last_seq))
     is_incomplete = not state.keys().isdisjoint(("rule_is_stale", "includes_overdue"))
-    is_earlier = version.version < since_version
     corrections = store.corrections.after(int(state.get("corrected_to", 0)))
-    must_rebuild = overdue_ids or is_incomplete or is_earlier or corrections
+    must_rebuild = overdue_ids or is_incomplete or version.version < since_version or corrections
     return RuleProgress(0 if must_rebuild else last_seq, overdue_to, overdue_ids)

@@ -68,5 +68,8 @@ class SettingTable(CellTable):
 
     def _read_peers(self, connection: sa.Connection) -> dict[str, dict[str, str]]:
         """Return the settings, by cell, of the product's other robot cells that have some."""
-        peers = self._scope.cells(connection)[1:]
-        return {name: settings for name in peers if (settings := read_settings(connection, name))}
+        return {
+            name: settings
+            for name in self._scope.cells(connection)[1:]
+            if (settings := read_settings(connection, name))
+        }

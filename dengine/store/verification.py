@@ -426,8 +426,9 @@ class CellCheck:
             computed = {entry_digest(digest, head, self.key) for digest in previous}
             digest = _bytes(row["digest"])
             if digest not in computed or _bytes(row["rows"]) != rows_digest(of_entry):
-                problem = _entry_fault(row["added"], of_entry)
-                yield self._fault(LEDGER.name, f"entry {row['number']}", problem)
+                yield self._fault(
+                    LEDGER.name, f"entry {row['number']}", _entry_fault(row["added"], of_entry)
+                )
             previous = {digest, *computed}
             self.digests.append(digest.hex())
             numbers.add(number)

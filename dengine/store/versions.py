@@ -134,8 +134,11 @@ class VersionTable(CellTable):
                 if not keeps_state(stored.version, number, self._keep)
             ]
             if dropped:
-                update = sa.update(VERSION).where(self._shared, VERSION.c.retrain.in_(dropped))
-                connection.execute(update.values(state=None))
+                connection.execute(
+                    sa.update(VERSION)
+                    .where(self._shared, VERSION.c.retrain.in_(dropped))
+                    .values(state=None)
+                )
         # Afterwards, so that the new state takes the room of those.
         self._database.insert(connection, VERSION.c.retrain, [row | {"version": number}])
         return number
@@ -262,8 +265,12 @@ class VersionTable(CellTable):
         """
         kept = VERSION.c.state.is_not(None).label("kept")
         n_bytes = sa.func.coalesce(sa.func.length(VERSION.c.state), 0).label("n_bytes")
-        columns = (column for column in VERSION.c if column.name != "state")
-        query = sa.select(*columns, VERSION.c.retrain.label("number"), n_bytes, kept)
+        query = sa.select(
+            *(column for column in VERSION.c if column.name != "state"),
+            VERSION.c.retrain.label("number"),
+            n_bytes,
+            kept,
+        )
         scope = Scope(self._database.cell_id) if cell_only else self._scope
         rows = self._read(query.where(scope.shared(VERSION.c.cell_id)).order_by(VERSION.c.retrain))
         return [

@@ -130,8 +130,12 @@ class DecisionGroup:
         """
         if self.source is not None and self.success is None:
             return "forgotten"
-        is_check = self.action is Action.VERIFY and not self.quarantined
-        is_overdue = self.source is None and self.aged and is_check
+        is_overdue = (
+            self.source is None
+            and self.aged
+            and self.action is Action.VERIFY
+            and not self.quarantined
+        )
         return "overdue" if is_overdue else LABEL_WORDS[self.success]
 
 

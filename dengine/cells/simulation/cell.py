@@ -208,8 +208,8 @@ def _make_generators(seed: int, cycle: int) -> list[np.random.Generator]:
 
     They depend on seed and cycle alone.
     """
-    seeds = np.random.SeedSequence(entropy=seed, spawn_key=(cycle,)).spawn(3)
-    return [np.random.default_rng(part) for part in seeds]
+    seeds = np.random.SeedSequence(seed, spawn_key=(cycle,)).spawn(3)
+    return list(map(np.random.default_rng, seeds))
 
 
 class SimulatedCell:

@@ -103,8 +103,11 @@ def push(conditions: Conditions, time_step_s: float = TIME_STEP_S) -> Push:
     if conditions.fault == "missed_grasp":
         return Push(force, height_mm=-LENGTH_MM, slip_mm=0.0)
     top_mm = 1000 * float(data.site("top").xpos[2])
-    slip_mm = 1000 * float(data.joint("in_hand").qpos[0])
-    return Push(force, height_mm=top_mm - (LENGTH_MM - DEPTH_MM), slip_mm=slip_mm)
+    return Push(
+        force,
+        height_mm=top_mm - (LENGTH_MM - DEPTH_MM),
+        slip_mm=1000 * float(data.joint("in_hand").qpos[0]),
+    )
 
 
 def _drive(mujoco: Any, model: Any, data: Any, conditions: Conditions, steps: int) -> Floats:
@@ -187,8 +190,7 @@ def cell_xml(c: Conditions, time_step_s: float) -> str:
 
 def _spring(stiffness: float, inertia: float) -> str:
     """Return a spring's attributes in MJCF; its viscous damping is 0.6 of the critical damping."""
-    damping = 2 * 0.6 * math.sqrt(stiffness * inertia)
-    return f'stiffness="{stiffness}" damping="{damping}"'
+    return f'stiffness="{stiffness}" damping="{2 * 0.6 * math.sqrt(stiffness * inertia)}"'
 
 
 def _part_xml(c: Conditions) -> str:

@@ -133,9 +133,10 @@ class RtdeRecipe:
         `actual_TCP_force[2]`.
         """
         sizes = [len(TYPES[field_type]) for field_type in self.types]
-        fields = zip(self.names, sizes, strict=True)
         return tuple(
-            name if size == 1 else f"{name}[{i}]" for name, size in fields for i in range(size)
+            name if size == 1 else f"{name}[{i}]"
+            for name, size in zip(self.names, sizes, strict=True)
+            for i in range(size)
         )
 
     def pack(self, values: Mapping[str, float]) -> bytes:

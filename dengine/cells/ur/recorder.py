@@ -113,8 +113,9 @@ class RtdeRecorder(AbstractContextManager["RtdeRecorder"]):
         self._before = before
         self.where = f"{host}:{port}"
         values = (*self._columns, *self._signals.values(), *also)
-        connect = partial(RtdeClient, host, port, values, inputs, rate_hz, timeout)
-        self.stream = RtdeStream(connect, rate_hz)
+        self.stream = RtdeStream(
+            partial(RtdeClient, host, port, values, inputs, rate_hz, timeout), rate_hz
+        )
         self._step = self.stream.step
         self._reset()
 
