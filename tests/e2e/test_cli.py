@@ -234,7 +234,8 @@ def test_a_run_and_its_status_say_when_safe_mode_began_when_it_ended_and_what_is
 ):
     parts, store = easy_parts(700, 1, wave=slice(300, 400)), tmp_path / "engine.db"
     data = save(tmp_path / "changing.npz", parts, serial=parts.part)
-    succeed("data", data, "--set", "part.column=serial", "--set", "channels.X=N", "--save")
+    stated = "--set part.column=serial --set channels.X=N --set label.good=1 --set label.bad=0"
+    succeed("data", data, *stated.split(), "--save")
     words = f"run --data {data} --store {store} --reducer pca".split()
     shown = document(*words, *KNOWN, "--audit-rate", 0.1, "--cycles", 320)
     (change,) = shown["safe_mode_changes"]
