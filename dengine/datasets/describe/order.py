@@ -23,7 +23,7 @@ STAMP = re.compile(
     r"|20[0-4]\d[01]\d[0-3]\d[T_ -]?\d{4}(\d\d)?)$"
 )
 YEAR = re.compile(r"20[0-4]\d([01]\d[0-3]\d((\d\d){1,3})?)?")  # with month, day and time of day
-MARK = re.compile(r"[-_. :T/]*")  # between the numbers of a date
+MARK = re.compile(r"[-_. :T/]?")  # between the numbers of a date
 # Numbers of a date with the day or the month first, like 010324 and the time of day.
 DAY_FIRST = re.compile(
     r"[0-3]?\d[0-3]\d(20)?[0-4]\d[0-2]\d[0-5]\d([0-5]\d)?|[0-3]?\d[0-3]\d20[0-4]\d"
