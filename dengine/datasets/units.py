@@ -65,8 +65,9 @@ def unit_in(name: str) -> str:
 
     It must be a unit in `units.toml`, in brackets, or behind `in`, `/`, `_` or `..`, and is
     returned without them; a point or `_` behind it (`Force..N.`, `Force_N_`) is left out. What is
-    in brackets or behind `in` counts as a whole: `Force [N/mm]` has none. Behind `/` or `_` a
-    single character is none, except N, and `in`: `Fz_W` is a force in world axes.
+    in brackets or behind `in` counts as a whole: `Force [N/mm]` has none. Behind `/` or `_`
+    neither `in` is one (`Force_in` may be an input) nor a single character but N (`Fz_W` is a force
+    in world axes).
     """
     match = re.search(r"(?:[\[({<]|\bin )\s*([^\[\](){}<>_]+?)\s*[\])}>_.]?$", name) or re.search(
         r"(?:\.\.|[/_](?!(?:[^N]|in)[_.]?$))\s*([^\[\](){}<>/_ ]+?)[_.]?$", name

@@ -225,7 +225,8 @@ def read_tables(p: Proposal) -> list[Table]:
     """Return the tables of some of the files `p.names`, at least one, with the same column names.
 
     `p` is the description so far, and `p.names` are the files of recordings. At most 60 of them are
-    read, spread evenly over all, and no further file once 2 MB were read. Of text files only those
+    read, spread evenly over all; if 60 of the size of the first have more than 2 MB, fewer, but at
+    least three. Of text files only those
     count whose form (delimiter, number of columns, header) is the most frequent: the keys of
     `[text]`, which state this form, are set in `p` first. Text files of another form move from
     `p.names` to `p.others`, and `exclude` may be set to `?`: the user must say whether they are

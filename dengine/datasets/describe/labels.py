@@ -111,8 +111,8 @@ def in_paths(paths: Names) -> list[str]:
     behind it at the end. A word for unchecked is one, too, like "pending". Each expression has only
     the words that it finds; one that finds folders at different heights above the files is left
     out. The list is empty if any path negates such a word, like "not_passed", has true or false
-    after a name, like "leak=False", or words of both kinds, like "F=NOK_S=OK": the meaning is open
-    then.
+    after a name, like "leak=False" or "data/False/", or has a word for bad and another such word,
+    like "F=NOK_S=OK" or "NOK_pending": the meaning is open then.
     """
     stems = [*map(without_suffix, paths)]
     kinds = [{w.lower() in BAD for w in ALONE.findall(stem)} for stem in stems]
@@ -292,9 +292,10 @@ def n_contradictions(source: LabelSource, words: Words, other: LabelSource, othe
 def unmatched(p: Proposal, counted: Iterable[LabelSource]) -> Iterator[str]:
     """Yield a text on each listing with a verdict of which `counted` has no source.
 
-    `counted` are the sources of labels for recordings of `p`; a listing that names half of them or
-    fewer is not among these. A listing is a file with a row for each recording or part, and its
-    verdict a column that is named like one.
+    `counted` are the sources of labels for recordings of `p`; a listing that has a word for half of
+    them or fewer is not among these, also if its rows with one key have different words. A listing
+    is a file with a row for each recording or part, and its verdict a column that is named like
+    one. Raises what `sources_of` raises.
     """
     listings = {source.listing for source in counted}
     for source in sources_of(p, ()):
@@ -308,14 +309,15 @@ def unmatched(p: Proposal, counted: Iterable[LabelSource]) -> Iterator[str]:
 
 
 def may_contradict(source: LabelSource, words: Words, label: Words, meanings: Meanings) -> bool:
-    """Return whether a source whose words have no known meaning goes another way than the label.
+    """Return whether a source that has words of unknown meaning may contradict the label.
 
-    It does if one of its words stands on good and on bad recordings, and the source either is named
-    like a verdict (`is_named_like_verdict`), or has two words that go with the labels beyond chance
-    (p below 5 % by Fisher's exact test): a folder `Ausschuss` with parts that the press calls OK.
+    It may if one of its words stands on good and on bad recordings, and the source either is named
+    like a verdict (`is_named_like_verdict`), or has just two words, and these go with the labels
+    beyond chance (p below 5 % by Fisher's exact test), like folders `Ausschuss` and `Serie`, if the
+    press calls a few parts in `Ausschuss` OK.
 
-    words, label : the word of each recording in the source and in the label. meanings : 1 or 0 by
-    word of the label.
+    words, label : the word of each recording in the source and in the label. meanings : 1 good, 0
+    bad, None not checked, by word of the label; recordings that are not checked do not count.
     """
     from scipy.stats import fisher_exact  # only here, since it takes a second to import
 
@@ -335,8 +337,9 @@ def is_known(source: LabelSource, words: Names) -> bool:
 def doubt_on(label: LabelSource, counted: Mapping[LabelSource, Words]) -> str:
     """Return why a source, though certain in itself, may not be the label; "" if nothing does.
 
-    `counted` has the words of each source, by recording. Another source may say bad where this one
-    says good, or have words without a known meaning that go another way (`may_contradict`).
+    `counted` has the words of each source, also of `label`, by recording. Another source may say
+    bad where this one says good, or good where it says bad, or have words without a known meaning
+    that may contradict it (`may_contradict`). The first such source gives the reason.
     """
     words = counted[label]
     for source, others in counted.items():
@@ -355,18 +358,20 @@ def propose_label(p: Proposal) -> None:
     listing (a file with a row for each recording). It is certain if it is named like a verdict
     (`is_named_like_verdict`) or stated by the user, has words for good and for bad, and all its
     words have a known meaning. The first certain source becomes the label, unless another source
-    contradicts it (`doubt_on`). If none is certain, but only one is named like a verdict or stated,
+    contradicts it (`doubt_on`), or no source is stated and a listing with a verdict names too few
+    recordings (`unmatched`). If none is certain, but only one is named like a verdict or stated,
     this source becomes the label. Its `good` or `bad` is `?` if none of its words is known to mean
     that; a word of unknown meaning is in neither list. But if any source has only known words, it
     becomes the label only if there is no other source. Sources that have the same word for each
     recording count as one here, and the first that is named like a verdict is used. Otherwise
     `label.column` is `?`, with a note that lists all sources, and the listings with a verdict that
-    name no recording. Further certain sources that have a word for each recording of the label
-    become checks, unless checks are stated; a note counts the words of the label, also on
-    `label.good` and `label.bad` if these are `?`. Raises DataError if a stated source has no words
-    or cannot be read, or, if none is stated, if cells of a column without another use are lists;
-    and SettingError for a malformed `windows.trigger`, the condition at which long recordings are
-    cut.
+    name too few recordings.
+
+    Further certain sources that have a word for each recording of the label become checks, unless
+    checks are stated; a note counts the words of the label, also on `label.good` and `label.bad` if
+    these are `?`. Raises DataError if a stated source has no words or cannot be read, or, if none
+    is stated, if cells of a column without another use are lists; and SettingError for a malformed
+    `windows.trigger`, the condition at which long recordings are cut.
     """
     label = p.description.label
     stated = [label] if any(getattr(label, kind) for kind in SOURCES) else []
@@ -376,10 +381,13 @@ def propose_label(p: Proposal) -> None:
     certain = [s for s in known if s in named and UNKNOWN not in s.good + s.bad]
     rivals = {tuple(counted[source].items()) for source in (counted if known else named)}
     doubt = "" if named and len(rivals) == 1 else NO_LABEL
+    strays = [] if stated else [*unmatched(p, counted)]
     if certain:
-        doubt = doubt_on(certain[0], counted) or next(unmatched(p, counted), "")
+        doubt = doubt_on(certain[0], counted)
+        if strays and not doubt:
+            doubt = "the labels may stand in that listing"
     if doubt:
-        titles = [*map(title_of, counted, counted.values()), *unmatched(p, counted), doubt]
+        titles = [*map(title_of, counted, counted.values()), *strays, doubt]
         p.put("label.column", UNKNOWN, "; ".join(titles))
         return
     label = (certain or named)[0]

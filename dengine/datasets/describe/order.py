@@ -108,14 +108,17 @@ def fits_all(pattern: re.Pattern[str], pieces: Sequence[Any]) -> bool:
 
 
 def is_out_of_order(words: Strings, is_fixed: bool, is_named: bool) -> bool:
-    """Return whether words that seem to rise from recording to recording do not.
+    """Return whether words that should rise from recording to recording do not.
 
-    Dates and times seem to rise, like 2026-01-31 and 20260131_235959, or seconds since 1970; and in
-    a place that is named like them any words with five digits. They must be in the order of
-    `sort_key`, which cannot order 01/31/26 (`is_unsorted`). So do words of `is_fixed` places that
-    are all different, if they are sorted as texts (P10 before P2) or fall throughout, or if the
-    last numbers in them count the recordings: the largest is less than twice as many above the
-    smallest as there are words.
+    Rising means in the order of `sort_key`. Dates and times should rise, like 2026-01-31,
+    20260131_235959 or seconds since 1970, and in a place that is named like them any words with
+    five digits or more. If `sort_key` cannot order one of them, like 01/31/26 (`is_unsorted`), they
+    do not rise.
+
+    Other words should rise only if the place is fixed, all words are different, and one of these
+    holds: they are sorted as texts (P10 before P2); they fall throughout; or the last numbers in
+    them count the recordings. Those are more than two different whole numbers, of which the largest
+    is above the smallest by less than twice the number of words.
 
     words : the word of each recording, in the order to be compared. is_fixed : whether the place
     has one word for each recording. is_named : whether it is named like a date or time.

@@ -186,13 +186,13 @@ def may_qualify(column: Column, n_rows: int) -> bool:
 
 
 def is_phase(column: Column) -> bool:
-    """Return whether a column without a unit has 2 to 12 different numbers.
+    """Return whether a column may number the phases of a cycle: it has 2 to 12 different numbers.
 
-    They differ by whole numbers, no cell is empty or a text, and they change within a recording.
+    They change within a recording, in steps of whole numbers; no cell is empty or a text, and the
+    column has no unit.
     """
-    n = len(column.counts)
-    is_whole = 1 < n <= MOST_WORDS and not (column.odd or (column.steps % 1).any())
-    return is_whole and not (column.fixed or column.unit)
+    is_few = 1 < len(column.counts) <= MOST_WORDS
+    return is_few and not (column.odd or column.fixed or column.unit or (column.steps % 1).any())
 
 
 def sources_named(p: Proposal, column: re.Pattern[str], line: re.Pattern[str]) -> list[PartSource]:
@@ -292,7 +292,7 @@ def _other_scales(p: Proposal) -> Iterator[str]:
     """Yield a text for each column or line above the header that shows that scales differ.
 
     It is named like a unit, a factor or a rate, or all its words are units, or numbers with one,
-    and come again; and its word is not the same in all recordings. Recordings in which it is
+    and come twice on average; its word is not the same in all recordings. Recordings in which it is
     missing, empty or changes are ignored. The columns are those without a role (such as channel,
     clock or label), and the lines are those of the first table. Raises SettingError for a malformed
     `windows.trigger`.
@@ -310,7 +310,7 @@ def may_be_channel(column: Column) -> bool:
     """Return whether a column may be a channel, if it has no other use in the description.
 
     It must have at least three different numbers, change within a recording, and be neither times
-    nor a status or phase (`is_status`), nor named like a counter of rows.
+    nor a status with a text (`is_status`), nor named like a counter of rows.
     """
     is_other = is_clock(column) or COUNTER_NAME.fullmatch(column.name) or is_status(column)
     return not (is_other or column.fixed) and len(column.counts) - len(column.odd) > 2
@@ -352,8 +352,11 @@ def find_lost(p: Proposal) -> None:
 def far_outliers(column: Column) -> dict[str, int]:
     """Return how often each word comes that is a number far outside all others, like -9999.
 
-    It comes twice or more, and lies below or above the others by more than their range, the other
-    such numbers left out. These are marks for lost samples or for overflow.
+    These are marks for lost samples or for overflow. The smallest or largest number, whichever is
+    farther from its neighbour, is taken away as long as that gap is more than the range of those
+    that remain, which are at least three. Of the numbers taken away, those that come twice or more
+    are returned. A number in two forms, like -9999 and -9999.0, has no gap. The result is empty if
+    a number is not written as `column.form` says.
     """
     words = np.array([word for word in column.counts if word not in column.odd], dtype=object)
     found = dict[str, int]()

@@ -190,10 +190,11 @@ def _head_lines(rows: Rows, width: int, stated: Stated) -> tuple[int, int]:
     ]
     header, units = max(heads, default=0), 0
     if len(heads) > 1:
-        above, names = (rows[i - 1] for i in heads[-2:])
-        names = [*filter(None, names)]
-        is_odd = _share_of_units(names) or len({*names}) < len(names)
-        if _share_of_units(names) > HALF:
+        above, last = (rows[i - 1] for i in heads[-2:])
+        names = [*filter(None, last)]
+        share = _share_of_units(names)
+        is_odd = share or len({*names}) < len(names)
+        if share > HALF:
             header, units = heads[-2:]
         elif "text.header" not in stated and (
             _share_of_units(above) == 1 or (is_odd and all(above))
@@ -216,11 +217,11 @@ def propose_form(p: Proposal, contents: Mapping[str, bytes], faults: Faults) -> 
 
     `p` is the description so far, and `[text]` its section on how text files are written. Files
     with another delimiter, number of columns or header are left out: they move from `p.names` to
-    `p.others`. If there are two or more of them, or the name of a single one differs by a number
-    only from that of a file in the result, `exclude` (the patterns of files that are no recordings)
-    is set to `?` (the user must answer), with a note that asks whether they are recordings. For a
-    file that is no text, or whose header is not certain, a fault (why it cannot be read) is
-    appended to `faults`, and it stays in `p.names`; if all are such, nothing is set, and the result
+    `p.others`. If two of them have the same form, or the name of one differs by a number only from
+    that of a file in the result, `exclude` (the patterns of files that are no recordings) is set to
+    `?` (the user must answer), with a note that asks whether they are recordings. For a file that
+    is no text, or whose header is not certain, a fault (why it cannot be read) is appended to
+    `faults`, and it stays in `p.names`; if more than half are such, nothing is set, and the result
     is empty. Of equally frequent forms that of the file with the most cells counts. Keys that the
     user stated stay. Raises LookupError for a stated encoding that Python does not know.
 
@@ -230,6 +231,8 @@ def propose_form(p: Proposal, contents: Mapping[str, bytes], faults: Faults) -> 
     for name, content in contents.items():
         with caught(faults, name):
             looks[name] = look(content, p.stated)
+    if 2 * len(looks) < len(contents):  # the few may be listings; the faults say what is wrong
+        return []
     forms = {name: (item.form.delimiter, item.width, item.line) for name, item in looks.items()}
     sizes = [(forms[name], len(item.rows) * item.width) for name, item in looks.items()]
     usual = most_frequent([*sizes, ((), 0)])
@@ -239,8 +242,6 @@ def propose_form(p: Proposal, contents: Mapping[str, bytes], faults: Faults) -> 
     alike = {DIGITS.sub("0", name) for name in odd} & {DIGITS.sub("0", name) for name in same}
     if len({forms[name] for name in odd}) < len(odd) or alike:
         p.put("exclude", UNKNOWN, f"are {listed(odd)} recordings of another form? See files")
-    if 2 * len(looks) < len(contents):
-        return []
     if same:
         _propose_keys(p, [looks[name] for name in same])
     return same

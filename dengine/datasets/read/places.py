@@ -168,9 +168,9 @@ def in_listing(name: str) -> Iterator[None]:
 class LabelReader:
     """Finds the label of a recording in one source.
 
-    listing : the different words by key, if the source is a listing. files : its keys by the file
-    name in them (`folders_of`). used : the keys that were found, each with the path of the first
-    recording that has it.
+    source : where the label stands. listing : the different words by key (`as_key`), empty if the
+    source is no listing. files : its keys by the file name in them, as `folders_of` writes it.
+    used : the keys that were found, each with the path of the first recording that has it.
     """
 
     source: LabelSource
@@ -181,14 +181,14 @@ class LabelReader:
     def word(self, table: Table, part: str) -> str:
         """Return the word that stands for the label of a recording, like "ok".
 
-        `table` is the table of the recording, and `part` its part number. If the source is a
-        listing (a file with a row for each recording or part), it is the word of all its rows with
-        the key of the recording. The key is the first of these that is listed: the number of the
-        part, the path, the file name, the path without suffix, the file name without suffix; they
-        are compared as `as_key` writes them, so 0012 is 12. Otherwise it is the only one with the
-        same file and, as far as both have them, the same folders (`folders_of`), like
-        `D:/Data/P7.tdms` for `P007.csv`. A word is "" if its cell is empty. The key is added to
-        `used`, the keys found so far.
+        `table` is the table of the recording, and `part` its part number. If the source is no
+        listing (a file with a row for each recording or part), `words_of` says where the word
+        stands. In a listing it is the word of all rows with the key of the recording. The key is
+        the first of these that is listed: the number of the part, the path, the file name, the path
+        without suffix, the file name without suffix; they are compared as `as_key` writes them, so
+        0012 is 12. If none is listed, the key is the only listed one with the same file name and,
+        as far as both have them, the same folders (`folders_of`), like `D:/Data/P7.tdms` for
+        `P007.csv`. A word is "" if its cell is empty. The key is added to `used`.
 
         Raises
         ------
@@ -207,11 +207,11 @@ class LabelReader:
         name = path.rpartition("/")[2]
         names = filter(None, (part, path, name, without_suffix(path), without_suffix(name)))
         keys = [key for key in map(as_key, names) if key in self.listing]
-        folders = folders_of(path)
-        alike = self.files.get(folders[0], ())
-        alike = [key for key in alike if all(map(eq, folders, folders_of(key)))]
-        if len(alike) == 1:
-            keys += alike
+        if not keys:
+            folders = folders_of(path)
+            alike = self.files.get(folders[0], ())
+            alike = [key for key in alike if all(map(eq, folders, folders_of(key)))]
+            keys = alike if len(alike) == 1 else []  # of several none is certain
         if not keys:
             raise UnreadableError(
                 f"Expected {part or name} in {source.listing}, it is not listed; it has "
@@ -270,20 +270,22 @@ class LabelReader:
 def as_key(word: str) -> str:
     """Return a word as a key of a listing, so that keys are equal if they mean the same.
 
-    A whole number, also one like `12.0`, loses its leading zeros, letters become small, and a
-    backslash becomes `/`. `="0012"`, like Excel writes a text, is the number 0012, and becomes
-    `12`.
+    A whole number loses its leading zeros, and a `.0` at its end; letters become small, and a
+    backslash becomes `/`. An `=` in front and quotes around the word are left out, so `="0012"`,
+    like Excel writes a text, becomes `12`.
     """
     word = word.removeprefix("=").strip('"').replace("\\", "/").lower()
     return re.sub(r"^0*(\d+)(\.0+)?$", r"\1", word)
 
 
 def folders_of(path: str) -> list[str]:
-    """Return the file name of a path, then its folders from the inside out, to be compared.
+    """Return the file name of a path, then its folders from the inside out, to compare paths.
 
-    The suffix of the file, capital letters and the leading zeros of numbers are left out.
+    The suffix of the file and a `./` in front are left out, letters become small, and each run of
+    digits loses its leading zeros, so `./Data/P007.csv` gives `p7` and `data`. Decimals lose them,
+    too: 0.05 becomes 0.5.
     """
-    plain = re.sub(r"(?<!\d)0+(?=\d)", "", as_key(without_suffix(path)))
+    plain = re.sub(r"(?<![\d.])0+(?=\d)", "", as_key(without_suffix(path)))
     return plain.removeprefix("./").split("/")[::-1]
 
 

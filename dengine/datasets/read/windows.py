@@ -26,10 +26,10 @@ def cut(table: Table, description: Description, base: Path) -> Iterator[Table]:
     A part is a window of rows, which a trigger, a condition on a signal, begins, or whose start and
     end are in a listing, a file in the folder `base`; with both stated the trigger counts. A
     trigger's window has `traces.samples` rows, or fewer at the end of the recording, which is no
-    damage. Windows of a listing come by increasing start. The `path` of a part's table is the
-    number of the part from 1, or its key in the listing. A part has `damage` (an error for which it
-    is left out) if a trigger begins it in a gap of the times, or if a window of the listing has no
-    samples, overlaps an earlier one, or goes beyond the recording.
+    damage. Windows of a listing come by increasing start, and one without samples has one row. The
+    `path` of a part's table is the number of the part from 1, or its key in the listing. A part has
+    `damage` (an error for which it is left out) if a trigger begins it in a gap of the times, or if
+    a window of the listing has no samples, overlaps an earlier one, or goes beyond the recording.
     If the labels are a topic of a ROS bag, that column has at most one cell: the first label
     between the start of the part and the start of the next. Raises DataError if `time.column` is
     not stated, if a trigger cuts and the rate is not stated, if no part is found, if the recording
@@ -98,9 +98,9 @@ def _listed(table: Table, times: Floats, description: Description, base: Path) -
     later, like dates, and all ends in the listing are smaller, its times count from the first of
     `times`. The rows are those from the start to before the end (less 1e-5 s, for rounding). A
     window has a fault (why it is left out) if it overlaps an earlier one, has no samples, or goes
-    beyond the recording by more than 1.5 steps of the stated rate (without one: at all). Raises
-    DataError if the listing or its times cannot be read, and LookupError for an encoding that
-    Python does not know.
+    beyond the recording by more than 1.5 steps of the stated rate (without one: at all); one
+    without samples gets the first row. Raises DataError if the listing or its times cannot be read,
+    and LookupError for an encoding that Python does not know.
     """
     about = description.windows
     bounds = []
@@ -123,4 +123,4 @@ def _listed(table: Table, times: Floats, description: Description, base: Path) -
                 "overlaps the window before"
             )
         least = max(least, end - TOLERANCE)
-        yield key, slice(*(rows[[0, -1]] + (0, 1) if len(rows) else (0, 1))), fault
+        yield key, slice(rows[0], rows[-1] + 1) if len(rows) else slice(0, 1), fault
