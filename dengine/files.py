@@ -163,7 +163,8 @@ def read_archive(
         }
         wanted = [key for key in sizes if names is None or key in names]
         check_size(sum(sizes[key] for key in wanted), title)
-        return {key: archive[key] for key in wanted}, list(sizes)
+        # NumPy gives the bytes of a member that is no array.
+        return {key: np.asarray(archive[key]) for key in wanted}, list(sizes)
 
 
 def is_database(path: Path) -> bool:

@@ -15,16 +15,17 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from .records import Ints
+
 QUANTUM = 65536.0  # steps per unit: 15 µN for newtons, below any sensor's noise
 CLAMP = float(2**46)  # |value * QUANTUM| stays below 2**62: the cast to int64 is defined everywhere
 MIX = -0x61C8864680B583EB  # odd, the golden ratio's 64 bits as a signed integer (Knuth)
 AUDIT_SALT = 0x2545F4914F6CDD1D
 COIN_BITS = 30
 BLOCK_SIZE = 256  # traces hashed at once: float64 and int64 copies of a large store miss the cache
-FoldArray = NDArray[np.int64]
 
 
-def hash_weights(size: int) -> FoldArray:
+def hash_weights(size: int) -> Ints:
     """Return pseudo-random odd integers, one for each sample of a trace; the same at each call.
 
     Parameters
@@ -48,7 +49,7 @@ def hash_weights(size: int) -> FoldArray:
     return z.view(np.int64)
 
 
-def content_hash(X: NDArray[np.floating]) -> FoldArray:
+def content_hash(X: NDArray[np.floating]) -> Ints:
     """Hash the content of traces, a weighted sum of the samples that wraps around at 64 bits.
 
     Each sample is first cast to float32, clipped to ±2**46 and rounded down to 1/65,536 of its
@@ -97,7 +98,7 @@ def trace_hash(content: int, part: str | None) -> int:
     return content if part is None else part_hash(part)
 
 
-def toss(hashes: FoldArray | int, salt: int = 0) -> FoldArray:
+def toss(hashes: Ints | int, salt: int = 0) -> Ints:
     """Return a pseudo-random integer from 0 to 2**30 - 1 for each hash, int64, in their shape.
 
     It is a fixed function of the hash and the salt, an integer that makes another sequence: the
@@ -110,7 +111,7 @@ def toss(hashes: FoldArray | int, salt: int = 0) -> FoldArray:
         return (h >> (63 - COIN_BITS)) & np.int64(2**COIN_BITS - 1)
 
 
-def fold_of(hashes: FoldArray | int, folds: int) -> FoldArray:
+def fold_of(hashes: Ints | int, folds: int) -> Ints:
     """Return the fold of each hash, 0 .. folds - 1, as int64 in the shape of the hashes.
 
     The fold depends on the hash and the number of folds alone, so it stays for life.
@@ -118,7 +119,7 @@ def fold_of(hashes: FoldArray | int, folds: int) -> FoldArray:
     return toss(hashes) % folds
 
 
-def content_fold(X: NDArray[np.floating], folds: int) -> FoldArray:
+def content_fold(X: NDArray[np.floating], folds: int) -> Ints:
     """Return the fold of each trace of (n, T) or (n, C, T) by its content, int64 (n,).
 
     A fold is 0 .. folds - 1. Equal traces are in one fold, whatever their parts' numbers.

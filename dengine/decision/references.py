@@ -427,7 +427,9 @@ class RadiusIndex(nn.Module):
         changes if no part has several points in it.
         """
         if int(self.repeats) > 0:
-            self.agreement.fill_(label_agreement(*map(self.column, COLUMNS[:-1])))
+            self.agreement.fill_(
+                label_agreement(*map(self.column, ("points", "labels", "spaces", "parts")))
+            )
 
     def get_state(self) -> State:
         """Return copies of the arrays of the index, by name, from which `from_state` restores it.

@@ -787,9 +787,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
             except NotTakenError as error:
                 # The label waits for the disk, and every part is verified until that is well.
                 log.warning("the label of %s: %s", decision.id, error)
-        return Cycle(
-            index, decision, outcome, success, source, seconds, self.poll(), self.safe_mode
-        )
+        retrain = self.poll()  # may change the safe mode
+        return Cycle(index, decision, outcome, success, source, seconds, retrain, self.safe_mode)
 
     # Learning
 

@@ -333,12 +333,6 @@ class Feedback:
             self._live.count_overdue(stored.decision)
         self._live.mark_examined_to(overdue_to)
 
-    def set_remedy(self, remedy: Remedy | None) -> None:
-        """Set what must be put right after a wrong label: None while it is done, or, if it failed
-        because the store is unavailable, the remedy again, in place of one that was set meanwhile.
-        """
-        self.remedy = remedy
-
     def begin_policy(self) -> None:
         """Drop the accepted parts that wait for an outcome, because another policy begins.
 

@@ -172,7 +172,7 @@ class Learner:
         remedy = self.feedback.remedy
         if remedy is None or not self._outbox.is_drained or self._outbox.fault:
             return
-        self.feedback.set_remedy(None)
+        self.feedback.remedy = None
         try:
             if remedy is Remedy.CORRECT:
                 self.end_training()  # what is being trained does not have the correction
@@ -180,7 +180,7 @@ class Learner:
             else:
                 self.live.rebuild_rule()
         except StoreError:
-            self.feedback.set_remedy(remedy)
+            self.feedback.remedy = remedy
             log.exception("the rule is rebuilt when the store is back")
         except Exception:  # of a user's model that is fitted again
             log.exception("the model in force does not learn a corrected label")

@@ -412,14 +412,15 @@ class Retrainer:
         left = self._count_seconds_left()
         if future is None or not (future.done() or wait > 0.0 or left <= 0.0):
             return None
-        with suppress(Exception):  # it is raised again below
+        with suppress(Exception):  # an error of the training is raised again below
             future.result(timeout=max(0.0, min(wait, left)))
         is_done = future.done()
         try:
             trained = future.result(timeout=0.0)
-            self._last_seconds.append(trained.last_seconds)
         except Exception as error:  # the failure is recorded, and the old version goes on answering
             trained = Trained(None, self._give_up(is_done, error), seq=self._seq)
+        else:
+            self._last_seconds.append(trained.last_seconds)
         self.future = None
         return replace(trained, begin=self.clock() - trained.seconds)
 

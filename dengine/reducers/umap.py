@@ -29,6 +29,7 @@ from typing import Any, Self
 
 import numpy as np
 import torch
+from numpy.random import Generator
 from numpy.typing import ArrayLike
 from scipy.sparse import csr_matrix
 from sklearn.utils.validation import check_is_fitted
@@ -418,7 +419,7 @@ class UmapReducer(Reducer):
         self,
         neighbors: Neighbors,
         graph: csr_matrix,
-        rng: np.random.Generator,
+        rng: Generator,
     ) -> Tensor:
         """Return the points (n, n_components), float32, at which a layout starts.
 

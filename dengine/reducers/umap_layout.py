@@ -19,6 +19,7 @@ from typing import Self
 
 import numpy as np
 import torch
+from numpy.random import Generator
 from numpy.typing import NDArray
 from scipy.optimize import curve_fit
 from scipy.sparse import csr_matrix
@@ -42,7 +43,7 @@ def spectral_start(
     graph: csr_matrix,
     frames: Tensor,
     n_components: int,
-    rng: np.random.Generator,
+    rng: Generator,
 ) -> Tensor:
     """Place traces by eigenvectors of their graph, as the start of a layout.
 
@@ -89,7 +90,7 @@ def spectral_start(
 def leading_eigenvectors(
     graph: csr_matrix,
     n: int,
-    rng: np.random.Generator,
+    rng: Generator,
 ) -> NDArray[np.float64] | None:
     """Compute n eigenvectors of D^(-1/2) A D^(-1/2), where A is the graph and D its degrees.
 

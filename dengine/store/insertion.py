@@ -122,7 +122,8 @@ class RecordInsertion:
             for label in new.values()
         ]
         numbers = {id_: row.seq for id_, row in stored.items()}
-        numbers |= zip(new, self._database.insert(connection, LABEL.c.seq, rows), strict=True)
+        new_numbers = self._database.insert(connection, LABEL.c.seq, rows)
+        numbers |= zip(new, new_numbers, strict=True)
         self._insert_events(connection, events, problems)
         for id_ in late_stops:
             event = new_event(

@@ -393,9 +393,8 @@ def find_integrity_error(connection: sa.Connection, cell_id: str, key: bytes, fi
         .limit(2)
     )
     newest, before = [*(row._asdict() for row in rows), {}, {}][:2]
-    if newest and newest["digest"] != entry_digest(
-        before.get("digest", START), newest | {"digest": None}, key
-    ):
+    previous = before.get("digest", START)
+    if newest and newest["digest"] != entry_digest(previous, newest | {"digest": None}, key):
         return "the newest entry of the ledger is not as it was written"
     chains = parse_object(newest.get("chains"))
     settings = _settings_chain(_settings_text(connection, cell_id))

@@ -230,8 +230,8 @@ def test_what_a_store_names_is_imported_only_where_its_caller_says_so(
 
 
 def test_an_object_is_taken_by_any_name_of_its_class_in_the_store():
-    texts = EngineSettings(Recipe("sklearn.decomposition:PCA")).to_store()
-    EngineSettings.from_store(texts, "cell.db", PCA())
+    settings = EngineSettings(Recipe("sklearn.decomposition:PCA"))
+    assert EngineSettings.from_store(settings.to_store(), "cell.db", PCA()) == settings
 
 
 def test_an_object_without_a_name_runs_and_is_handed_in_again(data, tmp_path):

@@ -12,6 +12,7 @@ take.
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
+from numpy.random import Generator
 from scipy.signal import lfilter
 
 from ...errors import DengineError, expect
@@ -51,7 +52,7 @@ def read_sensor(
     force: Floats,
     faults: SensorFaults,
     parameters: CellParameters,
-    rng: np.random.Generator,
+    rng: Generator,
 ) -> TraceArray:
     """Return what the sensor reports of a true force.
 
@@ -202,7 +203,7 @@ def _find_cause(conditions: Conditions, pushed: Push) -> str:
     return "stuck" if tip_mm <= STUCK_MM else "wedging"
 
 
-def _make_generators(seed: int, cycle: int) -> list[np.random.Generator]:
+def _make_generators(seed: int, cycle: int) -> list[Generator]:
     """Return three independent random generators of one cycle: for the physical conditions, for the
     sensor, and for what becomes known of a part that was passed on.
 

@@ -7,7 +7,7 @@ the course of a run. Units are in the names. `SimulatedCell` and `simulate` use 
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 
-import numpy as np
+from numpy.random import Generator
 
 from ...errors import expect
 
@@ -183,7 +183,7 @@ _DRAWN_BY: dict[str, str | Range] = {
 }
 
 
-def draw_conditions(parameters: CellParameters, rng: np.random.Generator) -> Conditions:
+def draw_conditions(parameters: CellParameters, rng: Generator) -> Conditions:
     """Draw the conditions of one insertion, its fault included; `rng` is advanced.
 
     A range is drawn uniformly; a setting with `_sd` in its name is the standard deviation of a

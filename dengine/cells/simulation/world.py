@@ -190,7 +190,8 @@ def cell_xml(c: Conditions, time_step_s: float) -> str:
 
 def _spring(stiffness: float, inertia: float) -> str:
     """Return a spring's attributes in MJCF; its viscous damping is 0.6 of the critical damping."""
-    return f'stiffness="{stiffness}" damping="{2 * 0.6 * math.sqrt(stiffness * inertia)}"'
+    damping = 2 * 0.6 * math.sqrt(stiffness * inertia)
+    return f'stiffness="{stiffness}" damping="{damping}"'
 
 
 def _part_xml(c: Conditions) -> str:

@@ -3,7 +3,6 @@ never own one cell.
 """
 
 import contextlib
-import os
 import shutil
 import subprocess
 import sys
@@ -19,11 +18,11 @@ from dengine import Action, DataEngine, Decision, Reason, Source
 from dengine.errors import StoreError
 from dengine.store import Event, NewLabel, StoredDecision
 from dengine.store.journal import FRAME, Journal, decode_record, encode_record
+from tests.conftest import NO_POSTGRES, POSTGRES
 from tests.slow.faults.__main__ import faults, preloaded
 from tests.slow.faults.harness import RECIPE, Cell, Outcome, Place
 from tests.slow.faults.kinds import ON_DISKS, Hung, killed_server, lock
 
-URL = os.environ.get("DENGINE_TEST_POSTGRES", "")
 ASIDE = (*ON_DISKS, killed_server)  # which want a library before the disk, or a server of their own
 FAULTS = {(where, words): fault for where, words, fault, _ in faults(1, 3, 2) if fault not in ASIDE}
 
@@ -32,8 +31,8 @@ FAULTS = {(where, words): fault for where, words, fault, _ in faults(1, 3, 2) if
 def test_a_fault_costs_no_label_raises_nothing_keeps_nobody_waiting_and_changes_no_decision(
     where: str, words: str, tmp_path: Path, request: pytest.FixtureRequest
 ) -> None:
-    if where == "PostgreSQL" and not URL:
-        pytest.skip("DENGINE_TEST_POSTGRES is unset: . .ci/postgres.sh")
+    if where == "PostgreSQL" and not POSTGRES:
+        pytest.skip(NO_POSTGRES)
     outcome = Outcome()
     at = (
         request.getfixturevalue("database")
