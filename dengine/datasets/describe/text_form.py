@@ -9,7 +9,8 @@ from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, replace
-from itertools import product
+from functools import partial
+from itertools import chain, product
 from operator import itemgetter
 from statistics import mode
 from typing import NamedTuple
@@ -35,6 +36,7 @@ MOST_BYTES = 2_000_000  # of a file that are read
 MOST_LINES = 200  # by which the delimiter and the first row of samples are found
 MOST_NAMES = 20  # columns without a header that get a name each
 DIGITS = re.compile(r"\d+")
+MARK = re.compile("[.,]")  # of decimals, or between groups of digits
 RULE = re.compile("[-=]*")  # a cell of a line that is drawn below the header
 HALF = 0.5  # a header has no more units among its names
 # Lines with a decimal comma: no whole number is written 05, nor stands between other delimiters.
@@ -50,12 +52,14 @@ class Look(NamedTuple):
     """The first lines of a file.
 
     form : of the file. width : cells of a row. line : the header. rows : the cells of the samples.
+    is_closed : whether the last cell of each row is empty.
     """
 
     form: TextForm
     width: int
     line: str
     rows: Rows
+    is_closed: bool
 
 
 def look(content: bytes, stated: Stated) -> Look:
@@ -80,8 +84,10 @@ def look(content: bytes, stated: Stated) -> Look:
     lines = text.rstrip("\n").split("\n")
     if not text.strip():
         raise DataError("Expected a text, got an empty file.")
-    marks = stated.get("text.delimiter", DELIMITERS)
-    scores = (_share_of_numbers(lines[:MOST_LINES], mark) for mark in marks)
+    scores = (
+        _share_of_numbers(lines[:MOST_LINES], mark)
+        for mark in stated.get("text.delimiter", DELIMITERS)
+    )
     _, width, delimiter = max(scores, key=itemgetter(0, 1))
     rows = [[*map(str.strip, split_line(line, delimiter))] for line in lines]
     data = _first_row(rows[:MOST_LINES], width)
@@ -92,7 +98,7 @@ def look(content: bytes, stated: Stated) -> Look:
         found = (i for i, line in enumerate(lines[:data], 1) if line.startswith(beginning))
         header = next(found, header)
     form = TextForm(encoding, delimiter, header=header, units=units, data=data + 1)
-    return Look(form, width, "".join(lines[header - 1 : header]), rows[data:])
+    return Look(form, width, "".join(lines[header - 1 : header]), rows[data:], is_closed)
 
 
 def decode(content: bytes, stated: str) -> tuple[str, str]:
@@ -103,7 +109,7 @@ def decode(content: bytes, stated: str) -> tuple[str, str]:
     UnreadableError if the text is in none of them or contains a zero character, and LookupError for
     a stated encoding that Python does not know.
     """
-    is_wide = content[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+    is_wide = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
     if stated:
         encoding, text = stated, to_utf8(content, stated)
     else:
@@ -231,19 +237,21 @@ def propose_form(p: Proposal, contents: Mapping[str, bytes], faults: Faults) -> 
     for name, content in contents.items():
         with caught(faults, name):
             looks[name] = look(content, p.stated)
-    if 2 * len(looks) < len(contents):  # the few may be listings; the faults say what is wrong
-        return []
+    if not looks or 2 * len(looks) < len(contents):
+        return []  # the few may be listings; the faults say what is wrong
     forms = {name: (item.form.delimiter, item.width, item.line) for name, item in looks.items()}
-    sizes = [(forms[name], len(item.rows) * item.width) for name, item in looks.items()]
-    usual = most_frequent([*sizes, ((), 0)])
+    usual = most_frequent(
+        [(forms[name], len(item.rows) * item.width) for name, item in looks.items()]
+    )
     same = [name for name, form in forms.items() if form == usual]
-    odd = [name for name, form in forms.items() if form != usual]
-    p.set_aside(odd)
-    alike = {DIGITS.sub("0", name) for name in odd} & {DIGITS.sub("0", name) for name in same}
-    if len({forms[name] for name in odd}) < len(odd) or alike:
+    odd = {name: form for name, form in forms.items() if form != usual}
+    p.set_aside([*odd])
+    without_numbers = partial(DIGITS.sub, "0")
+    if len({*odd.values()}) < len(odd) or (
+        {*map(without_numbers, odd)} & {*map(without_numbers, same)}
+    ):
         p.put("exclude", UNKNOWN, f"are {listed(odd)} recordings of another form? See files")
-    if same:
-        _propose_keys(p, [looks[name] for name in same])
+    _propose_keys(p, [looks[name] for name in same])
     return same
 
 
@@ -272,7 +280,7 @@ def _propose_keys(p: Proposal, looks: Sequence[Look]) -> None:
     names = () if p.stated.get("text.header") else tuple(_column_names(usual))
     for key, value in asdict(replace(form, names=names)).items():
         p.put(f"text.{key}", value)
-    cells = {cell for item in looks for row in item.rows for cell in row}
+    cells = {*chain.from_iterable(row for item in looks for row in item.rows)}
     propose_marks(p, [*filter(NUMBER.fullmatch, cells)])
 
 
@@ -292,8 +300,7 @@ def _column_names(usual: Look) -> Strings:
     cells = split_line(COMMENT.sub("", usual.line.lstrip(BLANK)), usual.form.delimiter)
     if len(cells) == width:
         return []
-    is_closed = not any(row[-1] for row in usual.rows if len(row) == width)
-    if is_closed and len(cells) == width - 1:
+    if usual.is_closed and len(cells) == width - 1:
         return header_names([*cells, ""])
     if width < MOST_NAMES:
         return [f"c{i}" for i in range(width)]
@@ -324,9 +331,8 @@ def propose_marks(p: Proposal, cells: Collection[str]) -> None:
     marks, groups = zip(*(key for key, n in n_read.items() if n == most), strict=True)
     p.put("text.decimal", marks[0])
     p.put("text.thousands", groups[0])
-    is_both = all({*".,"} <= {*cell} for cell in cells if groups[0] in cell)
-    if groups[0] in (".", ",") and not is_both:
+    marked = [*filter(MARK.search, cells)]
+    if any({*".,"} & {*cell} == {groups[0]} for cell in marked):
         p.put("text.thousands", UNKNOWN, "'.' or ',', or '' if there is none")
-    marked = [cell for cell in cells if {*cell}.intersection(".,")]
     if marked and (len({*marks}) > 1 or most < LIKELY * len(cells)):
         p.put("text.decimal", UNKNOWN, f"'.' or ','; {min(marked)} may be a fraction or a thousand")
