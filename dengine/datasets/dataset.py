@@ -184,8 +184,10 @@ class Dataset:
         for name, values in (("cause", self.cause), ("part", self.part), ("label", self.y)):
             if values is not None:
                 frame.insert(0, name, values)
-        about = {name: getattr(self, name) for name in ABOUT}
-        frame.attrs[OWN] = about | {"n_channels": channels, "columns": names}
+        frame.attrs[OWN] = {name: getattr(self, name) for name in ABOUT} | {
+            "n_channels": channels,
+            "columns": names,
+        }
         return frame
 
     def select(self, channels: Names) -> "Dataset":

@@ -133,8 +133,7 @@ def _dates(table: Table, name: str, unit: str, clock: Clock) -> Floats:
             whole = form.replace(".%f", "")
             times = times.fillna(pd.to_datetime(texts, format=whole, errors="coerce"))
         if times.dt.tz is None:
-            zone = (has_day(unit) and clock.zone) or "UTC"
-            times = times.dt.tz_localize(zone, ambiguous="infer")
+            times = times.dt.tz_localize((has_day(unit) and clock.zone) or "UTC", ambiguous="infer")
     table.refuse(times.isna().to_numpy(), f"a time of the form {unit}", name)
     zero = pd.Timestamp("1970-01-01" if has_day(unit) else "1900-01-01", tz="UTC")
     seconds: Floats = (times - zero).dt.total_seconds().to_numpy(np.float64)

@@ -58,8 +58,9 @@ def _table_of(source: str, rows: Rows, wanted: str) -> Table:
     if not rows:
         raise UnreadableError(f"Expected {wanted}, got none")
     lines, cells = zip(*rows, strict=True)
-    names = dict.fromkeys(chain(*cells))
-    columns = {name: as_cells([row.get(name) for row in cells]) for name in names}
+    columns = {
+        name: as_cells([row.get(name) for row in cells]) for name in dict.fromkeys(chain(*cells))
+    }
     return Table(source, columns, np.array(lines))
 
 
@@ -108,7 +109,7 @@ def _turned(value: Any) -> Mapping[Any, Any] | None:
     first = value[0] if isinstance(value, ITEMS) and len(value) else None
     if isinstance(first, Mapping):
         columns = {key: [item[key] for item in value] for key in first}
-        if any(isinstance(cells[0], ITEMS) for cells in columns.values()):
+        if any(isinstance(cell, ITEMS) for cell in first.values()):
             raise ValueError("lists within them, see 'Recordings that dengine does not read'")
         return columns
     if not isinstance(first, ITEMS):
@@ -178,8 +179,7 @@ def read_npz(content: bytes, source: str, has_all: bool) -> Table:
     columns = {k: np.atleast_1d(x if has_all else np.squeeze(x)) for k, x in arrays.items()}
     if not has_all:
         return Table(source, columns_of("", columns), [])
-    n = len(max(columns.values(), key=np.size))
-    return Table(source, columns, range(1, n + 1))
+    return Table(source, columns, range(1, len(max(columns.values(), key=np.size)) + 1))
 
 
 def read_ts(content: bytes, source: str, form: TextForm) -> Table:
