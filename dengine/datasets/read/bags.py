@@ -5,6 +5,7 @@ the messages' headers, `log_time` those of the log, both in nanoseconds. A colum
 another topic has in each row the newest `data` of that topic.
 """
 
+import re
 import struct
 from collections.abc import Collection, Iterator
 from dataclasses import replace
@@ -14,10 +15,10 @@ from typing import Any
 
 from ...errors import DataError, instead, listed
 from ...files import UNREADABLE, read_errors
-from ..dataset import Faults
+from ..dataset import Faults, expect_all
 from ..description import Description, Strings
 from ..table import Table, UnreadableError
-from .files import caught
+from .files import caught, first_of
 from .frames import read_frame
 from .split import signals_of, verdicts_of
 
@@ -25,6 +26,7 @@ SUFFIX = ".mcap"
 STAMP = "stamp"
 LOG_TIME = "log_time"
 PLACE = "place"
+TOPIC = re.compile("/[^.]*")  # with a field behind a point it is a channel
 
 
 def read_messages(path: Path, topics: Collection[str] | None) -> Iterator[tuple[str, int, Any]]:
@@ -99,13 +101,11 @@ def read_bag(
     import pandas as pd
 
     topics = {column.partition(".")[0] for column in description.channels}
-    if len(topics) > 1:
-        raise DataError(f"Expected channels of one topic, got {listed(sorted(topics))}.")
+    expect_all({f"channels of one topic, got {listed(sorted(topics))}": len(topics) < 2})
     verdicts = verdicts_of(description)
     others = {*description.part.column, *signals_of(description), description.order}
     # Of messages at one time, a label counts for the row before it, any other for the row itself.
-    places = {name: 0 for name in others if name.startswith("/") and "." not in name}
-    places |= dict.fromkeys(verdicts, 2)
+    places = dict.fromkeys(filter(TOPIC.fullmatch, others), 0) | dict.fromkeys(verdicts, 2)
     fields = {column: attrgetter(column.partition(".")[2]) for column in description.channels}
     rows = list[dict[str, Any]]()
     for name in names:
@@ -126,11 +126,13 @@ def read_bag(
     frame = frame.sort_values([LOG_TIME, PLACE])
     is_row = frame.pop(PLACE) == 1
     if not is_row.any():
-        why = f" {faults[0]}." if faults else ""
-        raise DataError(f"Expected messages of {listed(topics)}, found none.{why}")
+        raise DataError(f"Expected messages of {listed(topics)}, found none.{first_of(faults)}")
     for topic in places:
-        since_row = frame.groupby(is_row.cumsum())[topic]
-        frame[topic] = since_row.transform("first") if topic in verdicts else frame[topic].ffill()
+        frame[topic] = (
+            frame.groupby(is_row.cumsum())[topic].transform("first")
+            if topic in verdicts
+            else frame[topic].ffill()
+        )
     return replace(read_frame(frame[is_row], title), lines=[])
 
 

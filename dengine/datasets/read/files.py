@@ -130,6 +130,11 @@ def read_file(path: Path) -> bytes:
     return content
 
 
+def first_of(faults: Faults) -> str:
+    """Return the first fault for the end of a message, behind a blank; "" if there is none."""
+    return f" {faults[0]}." if faults else ""
+
+
 @contextmanager
 def caught(faults: Faults, source: str) -> Iterator[None]:
     """Context manager that turns a DataError in its block into a fault, and suppresses it.

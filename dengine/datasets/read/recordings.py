@@ -22,7 +22,7 @@ from ..table import Recording, Table, UnreadableError, as_word
 from ..units import bare, conversion, unit_in
 from .bags import read_bag
 from .clock import check_steps, times_of
-from .files import caught, find_files, is_unsorted, natural_key, read_file, sort_key
+from .files import caught, find_files, first_of, is_unsorted, natural_key, read_file, sort_key
 from .frames import read_frame
 from .places import LabelReader, listing_table, part_of, read_labels, stem_of
 from .split import split, table_of
@@ -41,13 +41,12 @@ def recording_of(
     The description says how the table of a part is read. Rows that its section `[rows]` drops, by a
     word in some column, are left out, then rows are sorted by time if `time.sort` is set, and their
     times are checked (`check_steps`); samples of rows that `[rows]` calls invalid are NaN. The
-    `length` of the recording is the number of rows kept, and its `rank` is what recordings are
-    sorted by, as `order` of the description says. A reader of a listing, a file with a row for each
-    recording or part, adds the key that it found to its `used`. The times and samples of a part
-    that was not checked must be readable, too, but may be of any length. If the description says
-    nothing of part numbers, a part that was cut out of a long recording (`[windows]`) has as part
-    number its key in the listing of such parts, or its number from 1 if a trigger, a condition on a
-    signal, cuts.
+    `length` of the recording is the number of rows kept. A reader of a listing, a file with a row
+    for each recording or part, adds the key that it found to its `used`. The times and samples of a
+    part that was not checked must be readable, too, but may be of any length. If the description
+    says nothing of part numbers, a part that was cut out of a long recording (`[windows]`) has as
+    part number its key in the listing of such parts, or its number from 1 if a trigger, a condition
+    on a signal, cuts.
 
     Parameters
     ----------
@@ -66,10 +65,8 @@ def recording_of(
         If a regular expression or a format of times in the description is invalid.
     """
     clock = description.time
-    order = description.order
     table = kept_rows(table.whole(), description.rows)
     seconds = times_of(table, clock, description.text) if clock.column else None
-    rank: Any = ""
     samples = [samples_of(table, *item, description.text) for item in description.channels.items()]
     lengths = [*map(len, samples if seconds is None else [*samples, seconds])]
     if len({*lengths}) > 1:
@@ -82,7 +79,6 @@ def recording_of(
             seconds = seconds[rows]
             samples = [values[rows] for values in samples]
         check_steps(seconds, clock, table)
-        rank = seconds[0] if order == "time" else rank
     for column, about in description.rows.items():
         is_lost = np.array(about.kinds(table.words(column))) == "invalid"
         samples = [np.where(is_lost, np.nan, values) for values in samples]
@@ -92,13 +88,7 @@ def recording_of(
     label = label_of(labels, table, part)
     if label is None:
         return None
-    if order == "path":
-        rank = natural_key(stem_of(description, table.path))
-    elif order not in ORDERS:
-        rank = sort_key(word := table.one_word(order, "first"))
-        table.refuse(
-            np.array([is_unsorted(word)]), "dates to sort by, with the year in front", order
-        )
+    rank = rank_of(table, seconds, description)
     return Recording(
         table.source,
         fitted(np.stack(samples), seconds, description),
@@ -107,6 +97,25 @@ def recording_of(
         lengths[0],
         rank,
     )
+
+
+def rank_of(table: Table, seconds: Floats | None, description: Description) -> Any:
+    """Return what recordings are sorted by, as `order` of the description says: `Recording.rank`.
+
+    `table` has the samples of a part, and `seconds`, shape (n,), their times; None without a clock.
+    Raises UnreadableError if `order` is a column that is missing, has lists or no rows, or whose
+    first word has a date that cannot be sorted (`is_unsorted`).
+    """
+    order = description.order
+    if order == "path":
+        return natural_key(stem_of(description, table.path))
+    if order not in ORDERS:
+        word = table.one_word(order, "first")
+        table.refuse(
+            np.array([is_unsorted(word)]), "dates to sort by, with the year in front", order
+        )
+        return sort_key(word)
+    return "" if order == "name" or seconds is None else seconds[0]
 
 
 @instead(UnreadableError, "Expected columns of one length", IndexError, ValueError)
@@ -240,10 +249,9 @@ def read_recordings(
     recordings, repeats = without_repeats(recordings)
     faults += repeats
     if not recordings:
-        why = "".join(f" {fault}." for fault in faults[:1])
         raise DataError(
             f"Expected recordings in {name}, none is left: {len(faults)} have faults, "
-            f"{n_unlabelled} no label.{why}"
+            f"{n_unlabelled} no label.{first_of(faults)}"
         )
     n_found = len(recordings) + len(faults) + n_unlabelled
     n_seen = description.seen.recordings
@@ -336,7 +344,6 @@ def dataset_of(recordings: Sequence[Recording], description: Description) -> Dat
     channels = [*description.channels.values()]
     clock = description.time
     fit = description.traces.lengths.removesuffix("-all")
-    is_grid = fit == "resample" and clock.column
     return make_dataset(
         X,
         labels,
@@ -346,7 +353,7 @@ def dataset_of(recordings: Sequence[Recording], description: Description) -> Dat
         part=parts if parts.any() else None,
         channels=tuple(description.channels),
         source=sources,
-        fit="strict" if is_grid else fit,
+        fit="strict" if fit == "resample" and clock.column else fit,
         lengths=lengths,
         ordered=np.count_nonzero(np.diff(labels)) != 1,
     )
