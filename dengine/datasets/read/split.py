@@ -118,11 +118,11 @@ def longest_list(table: Table) -> int:
 
     Of a list of lists all items count. 0 if none of these cells is a list with items.
     """
-    cells = [column[0] for column in table.columns.values() if len(column)]
     return max(
         (
             len(cell) * np.size(cell[0])
-            for cell in cells
+            for column in table.columns.values()
+            for cell in column[:1]
             if isinstance(cell, frames.ITEMS) and len(cell)
         ),
         default=0,
@@ -153,54 +153,68 @@ def _split_rows(table: Table, description: Description) -> Iterator[Table]:
         damage = [table.damage[i] for i in np.flatnonzero(is_beside)]
         breaks = rows[1:][np.diff(rows) > 1]
         if len(breaks) and not description.time.sort:
-            message = "Expected the rows of a part together, others stand between them"
-            damage.append(UnreadableError(message, table.line(breaks[0]), columns[0]))
+            damage.append(
+                UnreadableError(
+                    "Expected the rows of a part together, others stand between them",
+                    table.line(breaks[0]),
+                    columns[0],
+                )
+            )
         yield replace(table.take(rows), source=f"{table.source}, {' '.join(key)}", damage=damage)
 
 
 def _split_wide(table: Table, description: Description) -> Iterator[Table]:
     """Yield the table of each row, which is a part.
 
-    A channel or clock like `x*` gets its samples from the columns in which a number stands for the
-    `*`, in the order of these numbers, without empty cells at the end; its unit is that of the
-    first of these columns, and they are in no part themselves. Any other cell becomes a column of
-    one cell, or, if it is a list or mapping, one column or several (`frames.columns_of`); a column
-    without a cell for each row is in every part as a whole, and an empty one in none. A part has
-    `damage` (errors for which it is left out) if its row had a wrong number of cells. If a list of
-    lists or mappings in it has items that are not all alike, that is its only damage, and it has no
-    columns; a list that begins with a number or text may be mixed. Raises UnreadableError if the
-    columns of one `x*` differ in length.
+    A channel or clock like `x*` gets its samples from several columns (`_join_numbered`), without
+    empty cells at the end. Any other cell becomes a column of one cell, or, if it is a list or
+    mapping, one column or several (`frames.columns_of`); a column without a cell for each row is in
+    every part as a whole, and an empty one in none. A part has `damage` (errors for which it is
+    left out) if its row had a wrong number of cells. If a list of lists or mappings in it has items
+    that are not all alike, that is its only damage, and it has no columns; a list that begins with
+    a number or text may be mixed. Raises UnreadableError if the columns of one `x*` differ in
+    length.
     """
+    table = _join_numbered(table, description)
     n = len(table.lines)
-    origin: dict[str, list[str]] = {}
-    units = {**table.units}
-    cells = {name: column for name, column in table.columns.items() if len(column)}
-    for key in filter(lambda key: ANY in key, (*description.channels, *description.time.column)):
-        if names := [match[0] for match in match_numbered(key, table.columns)]:
-            origin[key] = names
-            units[key] = units.get(names[0], "")
-            with instead(UnreadableError, f"Expected columns of one length in {key}", ValueError):
-                cells[key] = np.stack([*map(table.column, names)], axis=1)
-    for name in chain(*origin.values()):
-        cells.pop(name, None)
     for i, line in enumerate(table.lines):
-        row = {name: column[i] if len(column) == n else column for name, column in cells.items()}
+        row = {name: c[i] if len(c) == n else c for name, c in table.columns.items()}
         damage = [error for error in table.damage if error.line == line]
         columns: frames.Columns = {}
         try:
             columns = frames.columns_of("", row)
         except UnreadableError as error:
             damage = [error]
-        columns |= {key: without_empty_end(columns[key]) for key in origin if key in columns}
+        for key in table.origin.keys() & columns.keys():
+            columns[key] = without_empty_end(columns[key])
         yield replace(
             table,
             source=f"{table.source}, row {line or i + 1}" if n > 1 else table.source,
             columns=columns,
             lines=[line],
-            units=units,
             damage=damage,
-            origin=origin,
         )
+
+
+def _join_numbered(table: Table, description: Description) -> Table:
+    """Return a table in which the columns of a channel or clock like `x*` are one, of arrays.
+
+    These are the columns in which a number stands for the `*`, in the order of these numbers
+    (`origin`); the unit is that of the first of them. They, and columns without cells, are left
+    out. Raises UnreadableError if the columns of one `x*` differ in length.
+    """
+    origin = dict[str, Strings]()
+    units = {**table.units}
+    columns = {name: column for name, column in table.columns.items() if len(column)}
+    for key in (*description.channels, *description.time.column):
+        if ANY in key and (names := [m[0] for m in match_numbered(key, table.columns)]):
+            origin[key] = names
+            units[key] = units.get(names[0], "")
+            with instead(UnreadableError, f"Expected columns of one length in {key}", ValueError):
+                columns[key] = np.stack([*map(table.column, names)], axis=1)
+    for name in chain(*origin.values()):
+        columns.pop(name, None)
+    return replace(table, columns=columns, units=units, origin=origin)
 
 
 def match_numbered(key: str, columns: Iterable[str]) -> list[re.Match[str]]:
@@ -209,8 +223,10 @@ def match_numbered(key: str, columns: Iterable[str]) -> list[re.Match[str]]:
     Each `*` in `key` stands for a number without a sign, and is a group of the match. `F_0.002`
     comes before `F_0.1`. Without `*` only the column `key` fits.
     """
-    matches = filter(None, map(pattern_of(key, NUMBERED).fullmatch, columns))
-    return sorted(matches, key=lambda match: [*map(float, match.groups())])
+    return sorted(
+        filter(None, map(pattern_of(key, NUMBERED).fullmatch, columns)),
+        key=lambda match: [*map(float, match.groups())],
+    )
 
 
 def _split_columns(table: Table, description: Description) -> Iterator[Table]:
@@ -229,15 +245,14 @@ def _split_columns(table: Table, description: Description) -> Iterator[Table]:
     for column in filter(pattern_of(channel).fullmatch, table.columns):
         if column not in shared:
             samples = without_empty_end(table.columns[column])
-            part = replace(
+            yield replace(
                 table,
                 source=f"{table.source}, column {column}",
                 path=column,
                 columns={**beside, channel: samples},
                 units={**table.units, channel: table.units.get(column, "")},
                 origin={channel: [column] * len(samples)},
-            )
-            yield part.take(slice(len(samples)))
+            ).take(slice(len(samples)))
 
 
 def without_empty_end(cells: Cells) -> Cells:
