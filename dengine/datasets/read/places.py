@@ -183,12 +183,8 @@ class LabelReader:
 
         `table` is the table of the recording, and `part` its part number. If the source is no
         listing (a file with a row for each recording or part), `words_of` says where the word
-        stands. In a listing it is the word of all rows with the key of the recording. The key is
-        the first of these that is listed: the number of the part, the path, the file name, the path
-        without suffix, the file name without suffix; they are compared as `as_key` writes them, so
-        0012 is 12. If none is listed, the key is the only listed one with the same file name and,
-        as far as both have them, the same folders (`folders_of`), like `D:/Data/P7.tdms` for
-        `P007.csv`. A word is "" if its cell is empty. The key is added to `used`.
+        stands. In a listing it is the word of all rows with the key of the recording (`key_of`),
+        which is added to `used`. A word is "" if its cell is empty.
 
         Raises
         ------
@@ -204,20 +200,7 @@ class LabelReader:
         path = table.path
         if not source.listing:
             return words_of(source, table, [source.column or source.topic], source.at)[0]
-        name = path.rpartition("/")[2]
-        names = filter(None, (part, path, name, without_suffix(path), without_suffix(name)))
-        keys = [key for key in map(as_key, names) if key in self.listing]
-        if not keys:
-            folders = folders_of(path)
-            alike = self.files.get(folders[0], ())
-            alike = [key for key in alike if all(map(eq, folders, folders_of(key)))]
-            keys = alike if len(alike) == 1 else []  # of several none is certain
-        if not keys:
-            raise UnreadableError(
-                f"Expected {part or name} in {source.listing}, it is not listed; it has "
-                f"{listed(sorted(self.listing)[:2])}; if its name contains the key, state part.path"
-            )
-        key = keys[0]
+        key = self.key_of(path, part)
         if self.used.setdefault(key, path) != path and key != as_key(part):
             raise UnreadableError(
                 f"Expected one file for {key} in {source.listing}, got {self.used[key]} before"
@@ -229,6 +212,31 @@ class LabelReader:
                 column=source.column,
             )
         return words[0]
+
+    def key_of(self, path: str, part: str) -> str:
+        """Return the key of a recording in the listing, by its path and the number of its part.
+
+        The key is the first of these that is listed: the number of the part, the path, the file
+        name, the path without suffix, the file name without suffix; they are compared as `as_key`
+        writes them, so 0012 is 12. If none is listed, the key is the only listed one with the same
+        file name and, as far as both have them, the same folders (`folders_of`), like
+        `D:/Data/P7.tdms` for `P007.csv`. Raises UnreadableError if there is none, or several.
+        """
+        name = path.rpartition("/")[2]
+        names = filter(None, (part, path, name, without_suffix(path), without_suffix(name)))
+        for key in map(as_key, names):
+            if key in self.listing:
+                return key
+        folders = folders_of(path)
+        alike = [
+            key for key in self.files.get(folders[0], ()) if all(map(eq, folders, folders_of(key)))
+        ]
+        if len(alike) == 1:  # of several none is certain
+            return alike[0]
+        raise UnreadableError(
+            f"Expected {part or name} in {self.source.listing}, it is not listed; it has "
+            f"{listed(sorted(self.listing)[:2])}; if its name contains the key, state part.path"
+        )
 
     def label(self, table: Table, part: str) -> int | None:
         """Return the label of a recording: 1 good, 0 bad, None not checked.
