@@ -10,11 +10,12 @@ import re
 from collections.abc import Container
 from contextlib import suppress
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from ..description import ANY, Strings, TextForm
-from ..table import Table, UnreadableError
+from ..table import Cells, Table, UnreadableError
 
 COMMENT = re.compile(r"^[#%]+\s*")
 LATIN = "cp1252"  # reads nearly any text
@@ -72,9 +73,14 @@ def read_text(
     names = _names(top, header, form)
     cells = split_line("".join(top[units - 1 : units]), form.delimiter)
     stated = dict(zip(names, map(str.strip, cells), strict=False))
-    columns = dict.fromkeys(names, np.empty(0))
-    lines = np.arange(first, end)
-    table = Table(source, columns, lines, stated, top[: (header or first) - 1], header)
+    table = Table(
+        source,
+        dict.fromkeys(names, np.empty(0)),
+        np.arange(first, end),
+        stated,
+        top[: (header or first) - 1],
+        header,
+    )
     return _read_plain(content, table, form, words) or _read_strictly(content, table, form)
 
 
@@ -206,13 +212,14 @@ def _read_plain(
     is_whole = len(frame) == len(table.lines) and isinstance(frame.index, pd.RangeIndex)
     if not is_whole or frame.iloc[:, -1].isin(["", np.nan]).any():  # the end of a cut row
         return None
-    columns = {}
-    for name, cells in frame.items():
-        if name in texts:  # equal words are one object
-            columns[name] = np.array(cells.array.categories, dtype=object)[cells.array.codes]
-        else:
-            columns[name] = cells.to_numpy()
-    return replace(table, columns=columns)
+    return replace(table, columns={name: _cells_of(cells) for name, cells in frame.items()})
+
+
+def _cells_of(cells: Any) -> Cells:
+    """Return the cells of a column of pandas: its numbers or bools, or the words of categories."""
+    if cells.dtype == "category":  # equal words are one object
+        cells = np.array(cells.array.categories, dtype=object)[cells.array.codes]
+    return np.asarray(cells)
 
 
 def _read_strictly(content: bytes, table: Table, form: TextForm) -> Table:
@@ -238,8 +245,12 @@ def _read_strictly(content: bytes, table: Table, form: TextForm) -> Table:
         if i >= table.lines[0] and line.strip() and not line.startswith(form.drop):
             row = split_line(line, form.delimiter)
             if len(row) != n:
-                message = f"Expected {n} cells, as there are columns, got {len(row)}; see text.drop"
-                damage.append(UnreadableError(message, i))
+                damage.append(
+                    UnreadableError(
+                        f"Expected {n} cells, as there are columns, got {len(row)}; see text.drop",
+                        i,
+                    )
+                )
                 row = [""] * n
             rows[i] = row
     if damage and len(damage) == len(rows):
