@@ -79,7 +79,7 @@ def propose_roles(p: Proposal) -> None:
     propose_clock(p)
     propose_part(p)
     propose_label(p)
-    propose_channels(p, {column.name: column.unit for column in p.unused if may_be_channel(column)})
+    propose_channels(p, {c.name: c.unit for c in filter(may_be_channel, p.unused)})
     find_lost(p)
     qualify_rows(p)
     clock = p.description.time
@@ -89,8 +89,7 @@ def propose_roles(p: Proposal) -> None:
         if clock.column and UNKNOWN not in clock.column + clock.format:
             propose_rate(p, p.tables)
         propose_lengths(p)
-    is_open = p.description.order == "name" and "order" not in p.stated
-    if is_open and UNKNOWN not in clock.column:
+    if p.description.order == "name" and "order" not in p.stated and UNKNOWN not in clock.column:
         propose_order(p)
     listings = {source.listing for source in p.description.labels}
     others = sorted({*p.others} - listings, key=natural_key)
@@ -111,8 +110,8 @@ def complete_rows(p: Proposal) -> None:
     rows = dict(p.description.rows)
     for name in rows.keys() & p.columns.keys():
         about = rows[name]
-        words = [*p.columns[name].counts]
-        others = tuple(word for word in sorted(words) if about.kinds([word]) == [""])
+        words = sorted(p.columns[name].counts)
+        others = tuple(word for word in words if about.kinds([word]) == [""])
         if len(others) > MOST_WORDS:
             others = (ANY,)
         key = "drop" if about.keep else "keep"
@@ -191,8 +190,9 @@ def is_phase(column: Column) -> bool:
     They change within a recording, in steps of whole numbers; no cell is empty or a text, and the
     column has no unit.
     """
-    is_few = 1 < len(column.counts) <= MOST_WORDS
-    return is_few and not (column.odd or column.fixed or column.unit or (column.steps % 1).any())
+    return 1 < len(column.counts) <= MOST_WORDS and not (
+        column.odd or column.fixed or column.unit or (column.steps % 1).any()
+    )
 
 
 def sources_named(p: Proposal, column: re.Pattern[str], line: re.Pattern[str]) -> list[PartSource]:
@@ -241,34 +241,40 @@ def propose_part(p: Proposal) -> None:
 def propose_channels(p: Proposal, units: Mapping[str, str]) -> None:
     """Set `[channels]` in `p` to one column, with its unit; does nothing if channels are stated.
 
-    The rules are tried in order, and the first that any column fits decides: a name like a force
-    along z; a name like a force, like `F` or like `value`, or a unit of force or torque; any
-    column. A name decides only if the unit is that of a force or torque, or unknown. The channels
-    stay empty, with a note, if `units` is empty, if several columns fit the rule, if the column
-    that fits has no unit of force or torque and another column has one, if the column that fits is
-    named like a set value or a limit or stands for columns that are not numbered evenly, like `x0`,
-    `x1`, `x5` (`_doubt_on`), or if a unit, a factor of scale or a sampling rate that the recordings
-    state differs between them (`_other_scales`). Raises SettingError for a malformed
-    `windows.trigger` (the condition at which a part begins).
+    It is the only likely one (`likely_channels`). The channels stay empty, with a note, if there is
+    none or several, if the column is named like a set value or a limit or stands for columns that
+    are not numbered evenly, like `x0`, `x1`, `x5` (`_doubt_on`), or if a unit, a factor of scale or
+    a sampling rate that the recordings state differs between them (`_other_scales`). Raises
+    SettingError for a malformed `windows.trigger` (the condition at which a part begins).
 
     units : the columns that may be channels, with their units, "" for unknown.
     """
     if p.description.channels:
         return
-    forces = [name for name, unit in units.items() if is_load(unit)]
-    likely = [name for name, unit in units.items() if not unit or name in forces]
-    named = [[*filter(pattern.search, likely)] for pattern in FORCES]
-    others = [*dict.fromkeys([*named[1], *forces])]
-    best = named[0] or others or [*units]
-    if not {*best} & {*forces}:
-        best = [*best, *forces]  # one has the name, another the unit
+    best = likely_channels(units)
     doubts = [*filter(None, (*(_doubt_on(p, name) for name in best), *_other_scales(p)))]
     if len(best) == 1 and not doubts:
         p.put("channels", {best[0]: units[best[0]]})
         return
     text = f"one or several of: {listed(units)}" if units else "no column has numbers that change"
-    text = "; ".join([text, *doubts])
-    p.notes |= dict.fromkeys(("channels", f"channels.{UNKNOWN}"), text)
+    keys = ("channels", f"channels.{UNKNOWN}")
+    p.notes |= dict.fromkeys(keys, "; ".join([text, *doubts]))
+
+
+def likely_channels(units: Mapping[str, str]) -> list[str]:
+    """Return the columns that are likely channels, of those in `units`, which has their units.
+
+    The rules are tried in order, and the first that any column fits decides: a name like a force
+    along z; a name like a force, like `F` or like `value`, or a unit of force or torque; any
+    column. A name decides only if the unit is that of a force or torque, or unknown, "". If no
+    column that fits has a unit of force or torque, those that have one come behind them.
+    """
+    forces = [name for name, unit in units.items() if is_load(unit)]
+    likely = [name for name, unit in units.items() if not unit or name in forces]
+    along_z, like_a_force = ([*filter(pattern.search, likely)] for pattern in FORCES)
+    best = along_z or [*dict.fromkeys([*like_a_force, *forces])] or [*units]
+    # One may have the name, another the unit.
+    return best if {*best} & {*forces} else [*best, *forces]
 
 
 def _doubt_on(p: Proposal, name: str) -> str:
@@ -362,12 +368,11 @@ def far_outliers(column: Column) -> dict[str, int]:
     found = dict[str, int]()
     with suppress(DataError):
         numbers = Table(column.name, {column.name: words}, []).numbers(column.name, column.form)
-        order = np.argsort(numbers)
+        order = np.argsort(numbers).tolist()
         while len(order) > 3:
             steps = np.diff(numbers[order])
             last = 0 if steps[0] > steps[-1] else -1
-            word = words[order[last]]
-            order = np.delete(order, last)
+            word = words[order.pop(last)]
             if steps[last] <= np.ptp(numbers[order]):
                 break
             if column.counts[word] > 1:  # once: a peak, behind which marks may lie
@@ -395,11 +400,12 @@ def propose_lengths(p: Proposal) -> None:
     others = [n for n in lengths if n != usual]
     most = SPARSE * len(lengths)
     if others:
-        text = (
+        p.put(
+            "traces.lengths",
+            "strict" if len(others) <= most else "pad",
             f"{len(others)} of {len(lengths)} recordings have another length, {min(others)} to "
-            f"{max(others)}; other choices: cut, pad-all, resample, strict"
+            f"{max(others)}; other choices: cut, pad-all, resample, strict",
         )
-        p.put("traces.lengths", "strict" if len(others) <= most else "pad", text)
     p.put("traces.samples", p.description.traces.samples or usual)
     n_filled = sum(np.array_equal(np.nan_to_num(x[-2:]), [0, 0]) for x in column.numbers)
     if n_filled > most and "traces.samples" not in p.stated:
