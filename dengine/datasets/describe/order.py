@@ -52,10 +52,9 @@ def propose_order(p: Proposal) -> None:
         by_path = sorted(stems, key=lambda path: natural_key(stems[path]))
         by_name = sorted(stems, key=file_key)
     files = by_name
-    is_proved = proves_order([stems[path] for path in by_path])
     # While it is open where the label stands, any folder or word may be one of a verdict.
     is_known = about.label.column != UNKNOWN
-    if is_known and is_proved:
+    if is_known and proves_order([stems[path] for path in by_path]):
         files = by_path
         p.put("order", "name" if by_path == by_name else "path")
     elif is_known:
@@ -74,32 +73,43 @@ def propose_order(p: Proposal) -> None:
 def proves_order(names: Strings) -> bool:
     """Return whether names in their order prove that the parts were made in this order.
 
-    The date is the first number that is a year from 2000 to 2049, or begins with one (20240131), in
-    all names, together with the numbers behind it if only marks like `-` or `/` stand between them.
-    Dates must never fall. If the names first differ in the date, the names of one date must prove
-    their order, too. If they first differ in another number, it must be distinct in each name and
-    rise, and so must any other number that is distinct in each. 31.12.2025 is read with the year
-    first; other numbers with the day first (010324080000), and AM and PM, prove nothing. If all
-    names are equal, no other order is possible.
+    Dates (`find_date`) must never fall. If the names first differ in the date, the names of one
+    date must prove their order, too. If they first differ in another number, it must be distinct in
+    each name and rise, and so must any other number that is distinct in each. 31.12.2025 is read
+    with the year first; other numbers with the day first (010324080000), and AM and PM, prove
+    nothing. If all names are equal, no other order is possible.
     """
     if len({*names}) == 1:
         return True
     pieces = [*zip_longest(*map(natural_key, names), fillvalue="")]
+    date = find_date(pieces)
+    dates = [*zip(*pieces[date.start : date.stop : 2], strict=True)]
+    if dates != sorted(dates) or any(map(HALF_DAY.search, names)):
+        return False
+    first = next(i for i, row in enumerate(pieces) if len({*row}) > 1)
+    if first in date:
+        days = groupby(zip(dates, names, strict=True), itemgetter(0))
+        return all(proves_order([*map(itemgetter(1), day)]) for _, day in days)
+    numbers = pieces[1 : date.start : 2] + pieces[date.stop + 1 :: 2]
+    counters = [row for row in numbers if len({*row, ""}) > len(names)]
+    is_odd = any([*row] != sorted(row) or fits_all(DAY_FIRST, row) for row in counters)
+    return pieces[first] in counters and not is_odd
+
+
+def find_date(pieces: Sequence[Any]) -> range:
+    """Return the places of the date in names.
+
+    The date is the first number that is a year from 2000 to 2049, or begins with one (20240131), in
+    all names, together with the numbers behind it if only marks like `-` or `/` stand between them.
+    Without a date it is the place behind the last piece.
+
+    pieces : for each place, the text or number of each name there; "" if a name has no more.
+    """
     n = len(pieces)
     begin = end = next((i for i in range(1, n, 2) if fits_all(YEAR, pieces[i])), n)
     while end + 2 < n and "" not in pieces[end + 2] and fits_all(MARK, pieces[end + 1]):
         end += 2
-    dates = [*zip(*pieces[begin : end + 1 : 2], strict=True)]
-    if dates != sorted(dates) or any(map(HALF_DAY.search, names)):
-        return False
-    first = next(i for i, row in enumerate(pieces) if len({*row}) > 1)
-    if begin <= first <= end:
-        days = groupby(zip(dates, names, strict=True), itemgetter(0))
-        return all(proves_order([name for _, name in day]) for _, day in days)
-    numbers = pieces[1:begin:2] + pieces[end + 2 :: 2]
-    counters = [row for row in numbers if "" not in row and len({*row}) == len(names)]
-    is_odd = any([*row] != sorted(row) or fits_all(DAY_FIRST, row) for row in counters)
-    return pieces[first] in counters and not is_odd
+    return range(begin, end + 1)
 
 
 def fits_all(pattern: re.Pattern[str], pieces: Sequence[Any]) -> bool:
@@ -107,7 +117,7 @@ def fits_all(pattern: re.Pattern[str], pieces: Sequence[Any]) -> bool:
     return all(map(pattern.fullmatch, map(str, pieces)))
 
 
-def is_out_of_order(words: Strings, is_fixed: bool, is_named: bool) -> bool:
+def is_out_of_order(words: Strings, place: str, is_fixed: bool) -> bool:
     """Return whether words that should rise from recording to recording do not.
 
     Rising means in the order of `sort_key`. Dates and times should rise, like 2026-01-31,
@@ -120,20 +130,21 @@ def is_out_of_order(words: Strings, is_fixed: bool, is_named: bool) -> bool:
     them count the recordings. Those are more than two different whole numbers, of which the largest
     is above the smallest by less than twice the number of words.
 
-    words : the word of each recording, in the order to be compared. is_fixed : whether the place
-    has one word for each recording. is_named : whether it is named like a date or time.
+    words : the word of each recording, in the order to be compared. place : the name of their
+    place. is_fixed : whether the place has one word for each recording.
     """
     ranks = [*map(sort_key, words)]
     is_sorted = ranks == sorted(ranks)
-    if all(map(STAMP.match, words)) or (is_named and all(map(STAMP_WORD.match, words))):
+    if all(map(STAMP.match, words)) or (
+        STAMP_NAME.search(place) and all(map(STAMP_WORD.match, words))
+    ):
         return not is_sorted or any(map(is_unsorted, words))
     if is_sorted or not is_fixed or len({*words}) < len(words):
         return False
-    if words == sorted(words) or ranks == sorted(ranks, reverse=True):
-        return True
     counts = [rank[-2] for rank in ranks if len(rank) > 1]
     is_count = len({*counts}) == len(words) > 2 and not any(n % 1 for n in counts)
-    return is_count and max(counts) - min(counts) < 2 * len(words)
+    is_dense = is_count and max(counts) - min(counts) < 2 * len(words)
+    return words == sorted(words) or ranks == sorted(ranks, reverse=True) or is_dense
 
 
 def unsorted_places(p: Proposal, tables: Tables) -> Iterator[tuple[str, str]]:
@@ -149,7 +160,7 @@ def unsorted_places(p: Proposal, tables: Tables) -> Iterator[tuple[str, str]]:
     """
     part = p.description.part
     parts = part_words(part, tables)
-    if is_out_of_order([*parts.values()], True, False):
+    if is_out_of_order([*parts.values()], "part", True):
         yield "part", listed(part.column) or RENAME
     sources = [LabelSource(column=column.name, at="first") for column in p.unused]
     sources += [LabelSource(line=line) for line in lines_of(p)]
@@ -161,7 +172,6 @@ def unsorted_places(p: Proposal, tables: Tables) -> Iterator[tuple[str, str]]:
     for source in sources:
         words = [*filter(None, words_of(p, source, tables, parts).values())]
         is_column = source.column and not source.listing
-        is_fixed = not is_column or bool(p.columns[source.column].fixed)
         place = source.column or source.line
-        if is_out_of_order(words, is_fixed, STAMP_NAME.search(place) is not None):
+        if is_out_of_order(words, place, not is_column or bool(p.columns[source.column].fixed)):
             yield place, source.column if is_column else RENAME
