@@ -2,6 +2,7 @@
 
 import re
 from collections import Counter
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 from ...errors import DataError, listed
@@ -37,40 +38,31 @@ def layout_of(p: Proposal, files: Tables) -> str:
     `p.names` may have more than were looked at, are `files`. A single one gives `?`, with a note on
     what to state.
 
-    For `long`, unless `part.column` is stated, it is set in `p`, which clears `part.path` and
-    `part.line`, also stated ones. It becomes the only column that may tell the parts apart, is
-    named like a part's number, has one run (successive rows with one word) of each word in all
-    files together, and at least a quarter as many runs as any column that may tell the parts apart;
-    if there are none or several, it becomes `?` with a note.
-
-    Raises DataError if the lists in 8 rows or more have fewer than 8 items, like the vectors of a
-    force and a torque, and UnreadableError if cells of columns that are looked at are lists.
+    For `long`, `part.column` is set in `p` (`_propose_part_column`). Raises DataError if the lists
+    in 8 rows or more have fewer than 8 items, like the vectors of a force and a torque, and
+    UnreadableError if cells of columns that are looked at are lists.
     """
     kind = p.description.format
+    wide = "npz" if kind == "npz" else "wide"
     first = files[0]
     clocks = columns_of(files[:1], p.description.text).values()
-    is_wide = numbered_columns(first) and not any(map(is_even_clock, clocks))
-    if kind in OBJECTS and len(p.names) > 1 and len(first.lines) == 1 and not is_wide:
+    if numbered_columns(first) and not any(map(is_even_clock, clocks)):
+        return wide
+    if kind in OBJECTS and len(p.names) > 1 and len(first.lines) == 1:
         return "files"
     longest = longest_list(first)
-    if not is_wide and 1 < longest < LEAST_RUN <= len(first.lines):
+    if 1 < longest < LEAST_RUN <= len(first.lines):
         raise DataError(
             f"Expected numbers or curves in the cells of {first.source}, got lists of {longest}: "
             "make a column of each item."
         )
-    if is_wide or longest > 1:
-        return "npz" if kind == "npz" else "wide"
+    if longest > 1:
+        return wide
     columns = columns_of(files, TextForm())
-    runs = [column for column in columns.values() if may_tell_parts(column)]
+    runs = [*filter(may_tell_parts, columns.values())]
     stated = columns.keys() & {*p.description.part.column}
     if runs or not all(columns[name].fixed for name in stated):
-        # The number of a part changes about as often as any other word.
-        least = max((c.n_runs for c in runs), default=0) / 4
-        parts = [c for c in runs if PART_NAME.search(c.name) and c.n_runs >= least]
-        likely = [c.name for c in parts if len(c.counts) == c.n_runs]
-        named = [n for n, c in columns.items() if PART_NAME.search(n) or has_long_runs(c)]
-        note = f"one of {listed(named)}, or several"
-        p.put("part.column", *(likely if len(likely) == 1 else (UNKNOWN, note)))
+        _propose_part_column(p, columns.values(), runs)
         return "long"
     if len(p.names) > 1:  # of large files only the first one is looked at
         return "files"
@@ -80,6 +72,25 @@ def layout_of(p: Proposal, files: Tables) -> str:
         "no curve is a table of results: nothing can be read"
     )
     return UNKNOWN
+
+
+def _propose_part_column(p: Proposal, columns: Iterable[Column], runs: Sequence[Column]) -> None:
+    """Set `part.column` in `p`, unless it is stated, to the column that tells the parts apart.
+
+    This clears `part.path` and `part.line`, also stated ones. It is the only one of `runs` that is
+    named like a part's number, has one run (successive rows with one word) of each word in all
+    files together, and at least a quarter as many runs as any of them; if there are none or
+    several, `part.column` becomes `?`, with a note.
+
+    columns : those of the files. runs : those that may tell the parts apart (`may_tell_parts`).
+    """
+    # The number of a part changes about as often as any other word.
+    least = max((c.n_runs for c in runs), default=0) / 4
+    parts = [c for c in runs if PART_NAME.search(c.name) and c.n_runs >= least]
+    likely = [c.name for c in parts if len(c.counts) == c.n_runs]
+    named = [c.name for c in columns if PART_NAME.search(c.name) or has_long_runs(c)]
+    note = f"one of {listed(named)}, or several"
+    p.put("part.column", *(likely if len(likely) == 1 else (UNKNOWN, note)))
 
 
 def is_even_clock(column: Column) -> bool:
@@ -98,8 +109,11 @@ def has_long_runs(column: Column) -> bool:
 
     False if a cell is empty, or if no table has more than one word.
     """
-    is_long = column.counts.total() >= LEAST_RUN * column.n_runs
-    return not column.fixed and is_long and "" not in column.counts
+    return (
+        not column.fixed
+        and column.counts.total() >= LEAST_RUN * column.n_runs
+        and "" not in column.counts
+    )
 
 
 def may_tell_parts(column: Column) -> bool:
@@ -124,8 +138,8 @@ def numbered_columns(table: Table) -> list[str]:
 
     The number may be a fraction, and a bracket or a unit in brackets may stand behind it.
     """
-    counts = Counter(NUMBER.sub(ANY, name) for name in table.columns)
-    return [pattern for pattern, n in counts.items() if n >= LEAST_NUMBERED]
+    patterns = Counter(NUMBER.sub(ANY, name) for name in table.columns)
+    return [pattern for pattern in patterns if patterns[pattern] >= LEAST_NUMBERED]
 
 
 def parts_of(p: Proposal, files: Tables) -> list[Table]:
@@ -143,8 +157,9 @@ def parts_of(p: Proposal, files: Tables) -> list[Table]:
     columns like `x0`, `x1` of one channel differ in length.
     """
     description, layout = p.description, p.description.layout
-    patterns = [ANY] if layout == "columns" else numbered_columns(files[0])
+    patterns = numbered_columns(files[0])
     if layout == "columns":
+        patterns = [ANY]
         clock = [*description.time.column, *filter(CLOCK_NAME.search, files[0].columns)]
         description = description.with_values({"time.column": clock})
     if not description.channels:
