@@ -16,7 +16,7 @@ import numpy as np
 
 from ...errors import DataError, listed
 from ..dataset import Faults
-from ..description import SOURCES, UNKNOWN, Description, LabelSource, PartSource
+from ..description import SOURCES, UNKNOWN, Description, LabelSource, PartSource, Strings
 from ..read.files import caught
 from ..read.places import part_of, read_labels, without_suffix
 from ..table import Table
@@ -73,6 +73,7 @@ Names = Iterable[str]
 CHANCE = 0.05  # that two words go with the labels like this
 Words = Mapping[str, str]  # by recording
 Meanings = Mapping[str, int | None]  # 1 good, 0 bad, None not checked, by word
+Counted = Mapping[LabelSource, Words]
 
 
 def with_meanings(source: LabelSource, words: Names) -> LabelSource:
@@ -175,8 +176,10 @@ def tables_of(p: Proposal) -> list[Table]:
     The tables that were looked at, `p.tables`, come first, then those of other files in `p.names`.
     """
     looked_at = {table.source for table in p.tables}
-    rest = [Table(name, {}, [], path=name) for name in p.names if name not in looked_at]
-    return [*p.tables, *rest]
+    return [
+        *p.tables,
+        *(Table(name, {}, [], path=name) for name in p.names if name not in looked_at),
+    ]
 
 
 def part_words(source: PartSource, tables: Tables) -> Words:
@@ -280,13 +283,9 @@ def count_sources(p: Proposal, stated: Sequence[LabelSource]) -> dict[LabelSourc
     return counted
 
 
-def n_contradictions(source: LabelSource, words: Words, other: LabelSource, others: Words) -> int:
-    """Return how many recordings are good by one source of labels and bad by the other.
-
-    words, others : the word of each recording in either source.
-    """
-    pairs = ((word, others.get(name, "")) for name, word in words.items())
-    return sum({source.meanings.get(a), other.meanings.get(b)} == {0, 1} for a, b in pairs)
+def place_of(source: LabelSource) -> str:
+    """Return the key in `[label]` that says where the label stands, like `path`; "" if none."""
+    return next((kind for kind in SOURCES if getattr(source, kind)), "")
 
 
 def unmatched(p: Proposal, counted: Iterable[LabelSource]) -> Iterator[str]:
@@ -295,8 +294,10 @@ def unmatched(p: Proposal, counted: Iterable[LabelSource]) -> Iterator[str]:
     `counted` are the sources of labels for recordings of `p`; a listing that has a word for half of
     them or fewer is not among these, also if its rows with one key have different words. A listing
     is a file with a row for each recording or part, and its verdict a column that is named like
-    one. Raises what `sources_of` raises.
+    one. If the user stated a source, nothing is yielded. Raises what `sources_of` raises.
     """
+    if place_of(p.description.label):
+        return
     listings = {source.listing for source in counted}
     for source in sources_of(p, ()):
         if source.listing and source.listing not in listings and is_named_like_verdict(source):
@@ -329,26 +330,42 @@ def may_contradict(source: LabelSource, words: Words, label: Words, meanings: Me
     return bool(is_mixed)
 
 
-def is_known(source: LabelSource, words: Names) -> bool:
-    """Return whether all words of a source mean good, bad or not checked."""
-    return {*words} <= source.meanings.keys()
+def is_known(source: LabelSource, words: Words) -> bool:
+    """Return whether the words of a source, by recording, all mean good, bad or not checked."""
+    return {*words.values()} <= source.meanings.keys()
 
 
-def doubt_on(label: LabelSource, counted: Mapping[LabelSource, Words]) -> str:
+def doubt_on(label: LabelSource, counted: Counted, strays: Strings) -> str:
     """Return why a source, though certain in itself, may not be the label; "" if nothing does.
 
     `counted` has the words of each source, also of `label`, by recording. Another source may say
     bad where this one says good, or good where it says bad, or have words without a known meaning
-    that may contradict it (`may_contradict`). The first such source gives the reason.
+    that may contradict it (`may_contradict`). The first such source gives the reason; without one,
+    any listing with a verdict that names too few recordings does, on which `strays` has a text.
     """
     words = counted[label]
     for source, others in counted.items():
-        if n_odd := n_contradictions(label, words, source, others):
+        n_odd = sum(
+            {label.meanings.get(word), source.meanings.get(others.get(name, ""))} == {0, 1}
+            for name, word in words.items()
+        )
+        if n_odd:
             return f"two of these disagree on {n_odd:,} of {len(words):,} recordings"
-        is_open = not is_known(source, others.values())
-        if is_open and may_contradict(source, others, words, label.meanings):
+        if not is_known(source, others) and may_contradict(source, others, words, label.meanings):
             return "the words of another one may mean good and bad, too, and go another way"
-    return ""
+    return "the labels may stand in that listing" if strays else ""
+
+
+def are_one(named: Sequence[LabelSource], counted: Counted) -> bool:
+    """Return whether only one source may be the label, if none is certain.
+
+    `counted` has the words of each source by recording, and `named` those sources that are named
+    like a verdict or stated; there must be one. Sources that have the same word for each recording
+    count as one. Only the `named` ones count, or all, if any source has only known words.
+    """
+    has_known = any(is_known(source, words) for source, words in counted.items())
+    rivals = {tuple(counted[source].items()) for source in (counted if has_known else named)}
+    return len(rivals) == 1 and bool(named)
 
 
 def propose_label(p: Proposal) -> None:
@@ -359,13 +376,11 @@ def propose_label(p: Proposal) -> None:
     (`is_named_like_verdict`) or stated by the user, has words for good and for bad, and all its
     words have a known meaning. The first certain source becomes the label, unless another source
     contradicts it (`doubt_on`), or no source is stated and a listing with a verdict names too few
-    recordings (`unmatched`). If none is certain, but only one is named like a verdict or stated,
-    this source becomes the label. Its `good` or `bad` is `?` if none of its words is known to mean
-    that; a word of unknown meaning is in neither list. But if any source has only known words, it
-    becomes the label only if there is no other source. Sources that have the same word for each
-    recording count as one here, and the first that is named like a verdict is used. Otherwise
-    `label.column` is `?`, with a note that lists all sources, and the listings with a verdict that
-    name too few recordings.
+    recordings (`unmatched`). If none is certain, but only one may be the label (`are_one`), this
+    source, the first that is named like a verdict or stated, becomes the label. Its `good` or `bad`
+    is `?` if none of its words is known to mean that; a word of unknown meaning is in neither list.
+    Otherwise `label.column` is `?`, with a note that lists all sources, and the listings with a
+    verdict that name too few recordings.
 
     Further certain sources that have a word for each recording of the label become checks, unless
     checks are stated; a note counts the words of the label, also on `label.good` and `label.bad` if
@@ -374,29 +389,36 @@ def propose_label(p: Proposal) -> None:
     `windows.trigger`, the condition at which long recordings are cut.
     """
     label = p.description.label
-    stated = [label] if any(getattr(label, kind) for kind in SOURCES) else []
+    stated = [label] if place_of(label) else []
     counted = count_sources(p, stated)
-    named = [source for source in counted if stated or is_named_like_verdict(source)]
-    known = [s for s, words in counted.items() if is_known(s, words.values())]
-    certain = [s for s in known if s in named and UNKNOWN not in s.good + s.bad]
-    rivals = {tuple(counted[source].items()) for source in (counted if known else named)}
-    doubt = "" if named and len(rivals) == 1 else NO_LABEL
-    strays = [] if stated else [*unmatched(p, counted)]
+    named = [*counted] if stated else [*filter(is_named_like_verdict, counted)]
+    certain = [s for s in named if is_known(s, counted[s]) and UNKNOWN not in s.good + s.bad]
+    strays = [*unmatched(p, counted)]
+    doubt = "" if are_one(named, counted) else NO_LABEL
     if certain:
-        doubt = doubt_on(certain[0], counted)
-        if strays and not doubt:
-            doubt = "the labels may stand in that listing"
+        doubt = doubt_on(certain[0], counted, strays)
     if doubt:
-        titles = [*map(title_of, counted, counted.values()), *strays, doubt]
-        p.put("label.column", UNKNOWN, "; ".join(titles))
+        p.put(
+            "label.column",
+            UNKNOWN,
+            "; ".join([*map(title_of, counted, counted.values()), *strays, doubt]),
+        )
         return
     label = (certain or named)[0]
     words = counted[label]
     checks = tuple(source for source in certain[1:] if counted[source].keys() >= words.keys())
     p.description = replace(p.description, label=label, check=p.description.check or checks)
-    place = next(kind for kind in SOURCES if getattr(label, kind))
+    note_words(p, words)
+
+
+def note_words(p: Proposal, words: Words) -> None:
+    """Note in `p` how often each word of the label comes, also on its good or bad words if unknown.
+
+    words : the word of each recording.
+    """
+    label = p.description.label
     note = f"{counts_of(words.values())}, over {len(words):,} recordings"
-    p.notes[f"label.{place}"] = note
+    p.notes[f"label.{place_of(label)}"] = note
     for key in ("good", "bad"):
         if UNKNOWN in getattr(label, key):
             p.notes[f"label.{key}"] = f"which words, also one that may come? {note}"
