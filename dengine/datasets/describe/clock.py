@@ -2,6 +2,7 @@
 
 import math
 import re
+from collections.abc import Sequence
 from contextlib import suppress
 from itertools import pairwise
 
@@ -57,32 +58,19 @@ def propose_clock(p: Proposal) -> None:
 
     `p` is the description so far; only columns without a use in it are looked at. `time.column`
     becomes the only column that may tell the time, by its cells or its name (`is_clock`). It is set
-    to `?` (the user must answer), with a note, if several columns may, or if one may and others a
-    part of it, like a date or whole seconds that are the same in all rows of a recording; these are
-    not looked for beside a clock whose cells tell the day. If no column may tell the time,
-    `time.column` is `?` if the columns have no names, if one is named `s`, which may be seconds or
-    the tool's position, if one may count the samples (`is_counter`), or if one is named like a
-    clock and has numbers that change; otherwise it stays empty. Stated columns are kept; only their
-    forms are found. Of a column that is set, `time.format`, its unit or a pattern like `%H:%M:%S`,
-    may be `?` (`form_of`). Raises SettingError for a malformed `windows.trigger`, the condition at
-    which long recordings are cut.
+    to `?` (the user must answer), with a note, if others may be it, too, or a part of it
+    (`names_of_clocks`), or if only such others may; if there are none, it stays empty. Stated
+    columns are kept; only their forms are found. Of a column that is set, `time.format`, its unit
+    or a pattern like `%H:%M:%S`, may be `?` (`form_of`). Raises SettingError for a malformed
+    `windows.trigger`, the condition at which long recordings are cut.
     """
     clocks = [*filter(is_clock, p.unused)]
-    if is_stated := "time.column" in p.stated:
+    if "time.column" not in p.stated:
+        names = names_of_clocks(p, clocks)
+    else:
+        names = []
         clocks = [p.columns[name] for name in p.description.time.column]
-    has_days = any(has_day(form) for column in clocks for form in column.forms)
-    coarse = [c for c in p.unused if c.forms or (CLOCK_NAME.search(c.name) and len({*c.fixed}) > 1)]
-    names = [c.name for c in p.unused if c in clocks or (c in coarse and not has_days)]
-    if not clocks:
-        names = [
-            c.name
-            for c in p.unused
-            if is_counter(c) or (CLOCK_NAME.search(c.name) and c.usual_step)
-        ]
-        unused = [c.name for c in p.unused]
-        if "c0" in p.description.text.names or "s" in unused:  # no names; s may be the stroke
-            names = unused
-    if clocks and (is_stated or len(names) == 1):
+    if clocks and len(names) < 2:
         p.put("time.column", [column.name for column in clocks])
         p.put("time.format", [form_of(column, p) for column in clocks])
     elif names:
@@ -92,6 +80,33 @@ def propose_clock(p: Proposal) -> None:
             f"of {listed(names)}: one, several that are added (a date, a time, ms), or []: none; "
             "with time.sort=true if the rows of a part are not in the order of time",
         )
+
+
+def names_of_clocks(p: Proposal, clocks: Sequence[Column]) -> list[str]:
+    """Return the names of the columns without a use that may be the clock, or a part of it.
+
+    `clocks` are the columns that may tell the time (`is_clock`). The result has these and, unless
+    their cells tell the day, those that may be a part of a clock (`is_coarse`). If no column may
+    tell the time, it has all columns if they have no names, or if one is named `s`, which may be
+    seconds or the tool's position; otherwise those that may count the samples (`is_counter`). `p`
+    is the description so far. Raises SettingError for a malformed `windows.trigger`.
+    """
+    if clocks:
+        has_days = any(has_day(form) for column in clocks for form in column.forms)
+        return [c.name for c in p.unused if c in clocks or (is_coarse(c) and not has_days)]
+    names = [column.name for column in p.unused]
+    if "c0" in p.description.text.names or "s" in names:  # no names; s may be the stroke
+        return names
+    return [column.name for column in filter(is_counter, p.unused)]
+
+
+def is_coarse(column: Column) -> bool:
+    """Return whether a column may be a part of a clock, like a date, or whole seconds.
+
+    It has dates or times of day, or is named like a clock and has one word in each recording, but
+    not the same in all. Raises UnreadableError if cells are lists.
+    """
+    return bool(column.forms or (CLOCK_NAME.search(column.name) and len({*column.fixed}) > 1))
 
 
 def is_clock(column: Column) -> bool:
@@ -114,15 +129,18 @@ def is_clock(column: Column) -> bool:
 
 
 def is_counter(column: Column) -> bool:
-    """Return whether a column that is not named like a clock may tell the time all the same.
+    """Return whether a column that is no clock by `is_clock` may tell the time all the same.
 
     A mere numbering of the rows does not. The steps from row to row (`Column.steps`) decide. For a
-    column that is named like a counter (`index`, `sample`, `n`, ...) the result is True if any step
-    differs by more than 1 % from the median step, or if the median is negative. For any other
-    column it is True if no step differs so and the median is neither 0 nor 1; but it is False if
-    the column is named like a force, has a unit of a quantity that is not time, or is named like
-    `x*`, the samples of a table with a part in each row.
+    column that is named like a clock the result is True if any step is not 0. For one that is named
+    like a counter (`index`, `sample`, `n`, ...) it is True if any step differs by more than 1 %
+    from the median step, or if the median is negative. For any other column it is True if no step
+    differs so and the median is neither 0 nor 1; but it is False if the column is named like a
+    force, has a unit of a quantity that is not time, or is named like `x*`, the samples of a table
+    with a part in each row.
     """
+    if CLOCK_NAME.search(column.name):
+        return bool(column.usual_step)
     steps = column.steps
     usual = float(np.median(steps)) if len(steps) else 0.0
     is_even = are_even(steps, usual)
@@ -147,10 +165,10 @@ def epoch_of(column: Column) -> str:
     """
     for unit, zero in EPOCHS.items():
         scale = scale_of(unit)
-        if is_rate(column.usual_step * scale):
-            moment = np.concatenate(column.numbers)[0] * scale - zero
-            if YEARS[0] <= moment <= YEARS[1]:
-                return unit
+        if is_rate(column.usual_step * scale) and (
+            YEARS[0] <= np.concatenate(column.numbers)[0] * scale - zero <= YEARS[1]
+        ):
+            return unit
     return ""
 
 
@@ -222,12 +240,10 @@ def propose_rate(p: Proposal, tables: Tables) -> None:
     gap that the description has by then. If it refuses more recordings than 10 % plus one,
     `time.gap` is set to `?`, with a note on the first. If recordings of another length are stated
     to be resampled (`traces.lengths`), `traces.samples` becomes the number of samples for which
-    99 % of the recordings last; longer ones lose their end when they are read. `order` is set to
-    `time` if all recordings start after 1999 (UTC), also if the rate is `?`. If they do not, but no
-    two of them overlap in time, so that one clock runs on through all, and they do not stand in the
-    order of their times, `order` is `?`. Recordings whose times cannot be read are skipped. Raises
-    DataError if a stated format is no form or unit of times, or if a setting in `[time]` is wrong
-    (see `check_forms`).
+    99 % of the recordings last; longer ones lose their end when they are read. `order` may follow
+    from the times, also if the rate is `?` (`_order_by_times`). Recordings whose times cannot be
+    read are skipped. Raises DataError if a stated format is no form or unit of times, or if a
+    setting in `[time]` is wrong (see `check_forms`).
     """
     clock = p.description.time
     check_forms(clock, TextForm())  # the marks in numbers may be ? by now
@@ -237,12 +253,7 @@ def propose_rate(p: Proposal, tables: Tables) -> None:
             seconds = times_of(table, clock, p.description.text)
             clocks.append((table, np.sort(seconds) if clock.sort else seconds))
     spans = [(seconds[0], seconds[-1]) for _, seconds in clocks]
-    ordered = sorted(spans)
-    if min(spans, default=(0.0,))[0] > YEARS[0]:
-        p.put("order", "time")
-    elif spans != ordered and all(a[1] < b[0] for a, b in pairwise(ordered)):
-        text = "time, or name: one clock runs on through all recordings, and has another order"
-        p.put("order", UNKNOWN, text)
+    _order_by_times(p, spans)
     steps = [np.diff(seconds) for _, seconds in clocks]
     means = [s[s >= 0].mean() for s in steps if (s >= 0).any()]
     usual = float(np.median(means or 0.0))
@@ -257,9 +268,8 @@ def propose_rate(p: Proposal, tables: Tables) -> None:
         return
     p.put("time.rate_hz", float(f"{1 / usual:.5g}"))
     if p.description.traces.lengths == "resample":
-        spans = [seconds[-1] - seconds[0] for _, seconds in clocks]
-        n_steps = math.ceil(np.quantile(spans, SHORT) * p.description.time.rate_hz - EVEN)
-        p.put("traces.samples", n_steps + 1)
+        n_steps = np.quantile(np.diff(spans), SHORT) * p.description.time.rate_hz
+        p.put("traces.samples", math.ceil(n_steps - EVEN) + 1)
     faults: Faults = []
     for table, seconds in clocks:
         with caught(faults, table.source):
@@ -269,4 +279,24 @@ def propose_rate(p: Proposal, tables: Tables) -> None:
             "time.gap",
             UNKNOWN,
             f"{len(faults)} of {len(clocks)} recordings have such times: {faults[0]}; {ANSWERS}",
+        )
+
+
+def _order_by_times(p: Proposal, spans: Sequence[tuple[float, float]]) -> None:
+    """Set `order` in `p` to `time` if the recordings have dates, to `?` if their times contradict.
+
+    They have dates if all start after 1999 (UTC). If they do not, but no two of them overlap in
+    time, so that one clock runs on through all, and they do not stand in the order of their times,
+    `order` is `?` (the user must answer), with a note. A stated `order` stays.
+
+    spans : the first and the last time of each recording, in seconds.
+    """
+    ordered = sorted(spans)
+    if min(spans, default=(0.0,))[0] > YEARS[0]:
+        p.put("order", "time")
+    elif spans != ordered and all(a[1] < b[0] for a, b in pairwise(ordered)):
+        p.put(
+            "order",
+            UNKNOWN,
+            "time, or name: one clock runs on through all recordings, and has another order",
         )
