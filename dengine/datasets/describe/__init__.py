@@ -155,12 +155,7 @@ def likely_endings(names: Strings) -> Strings:
     They are the suffixes that more than a fifth as many files have as the most frequent one, and
     `.mcap` even if only one file has it; beside such a file they need two. Those that dengine does
     not read (`FOREIGN`) count only if more files have them than any other. If there is only one,
-    and the files are one for each part and signal, like `1_Kraft.csv` and `1_Weg.csv`, the endings
-    of the signals, `Kraft.csv` and `Weg.csv`, come before it. Such an ending is what stands behind
-    the last `-`, `_` or blank of a name, and the part is what stands before. There must be at least
-    two parts and two such endings, and each part must have a file with each ending. If any ending
-    is a word like `ok` or `pending`, none counts. If any has a digit, they count only if there are
-    2 to 4 endings and 10 parts or more: they are then numbered pieces of a part's curve.
+    the endings of signals (`signal_endings`), if the files have such, come before it.
     """
     counts = Counter(map(suffix_of, names))
     most = max(counts.values())
@@ -171,6 +166,19 @@ def likely_endings(names: Strings) -> Strings:
         for suffix, n in counts.items()
         if suffix == BAG or (n >= least and n * FEW > most and (suffix in SUFFIXES or n > readable))
     ]
+    return [*signal_endings(names), *likely] if len(likely) == 1 else likely
+
+
+def signal_endings(names: Strings) -> Strings:
+    """Return the endings of signals, like `Kraft.csv`, if there is a file for each part and signal.
+
+    Otherwise there are none. Such an ending is what stands behind the last `-`, `_` or blank of a
+    name, and the part is what stands before: `1_Kraft.csv` and `1_Weg.csv` are two signals of one
+    part. There must be at least two parts and two endings, and each part must have a file with each
+    ending. If any ending is a word like `ok` or `pending`, none counts. If any has a digit, they
+    count only if there are 2 to 4 endings and 10 parts or more: they are then numbered pieces of a
+    part's curve.
+    """
     words = [re.split(r"[-_ ](?=[^-_ /]+$)", name) for name in names]
     n_parts = len({name[0] for name in words})
     endings = sorted({name[-1] for name in words})
@@ -178,8 +186,7 @@ def likely_endings(names: Strings) -> Strings:
     no_signal = rf"(?i)\b({WORD})\."
     if len(endings) > MOST_PIECES or n_parts < LEAST_PARTS:
         no_signal += r"|\d"
-    is_signal = len(likely) == 1 and is_grid and not re.search(no_signal, " ".join(endings))
-    return [*endings, *likely] if is_signal else likely
+    return endings if is_grid and not re.search(no_signal, " ".join(endings)) else []
 
 
 def suffix_of(name: str) -> str:
@@ -216,7 +223,7 @@ def globs(names: Strings) -> list[str]:
     They are like `*.csv`, or `**/*.csv` if any file is in a subfolder, and sorted. The suffix has
     `.gz` behind it if the file has, and its capital letters stay.
     """
-    folders = "**/" if any("/" in name for name in names) else ""
+    folders = "**/" if "/" in "".join(names) else ""
     endings = {name.removeprefix(without_suffix(name)) for name in names}
     return sorted(f"{folders}*{end}" for end in endings) if len(names) > 1 else [*names]
 

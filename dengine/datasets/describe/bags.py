@@ -65,12 +65,12 @@ def propose_bag(p: Proposal) -> None:
         if not times:
             raise
     propose_channels(p, units)
-    channels = [*p.description.channels]
+    channels = p.description.channels
     p.put("ignored", {name: unit for name, unit in units.items() if name not in channels})
     p.put("time.column", STAMP if is_stamped else LOG_TIME)
     p.put("time.format", "ns")
     topic = [*channels, *units, ""][0].partition(".")[0]
-    clock = {name: np.array(times[topic]) for name in p.description.time.column}
+    clock = dict.fromkeys(p.description.time.column, np.array(times[topic]))
     propose_rate(p, [Table(topic, clock, [])])
     p.put("traces.samples", UNKNOWN, "how many samples has a part from where it begins?")
     topics = f"one of {'; '.join(f'{t} ({counts_of(cells)})' for t, cells in words.items())}"
