@@ -215,8 +215,8 @@ class LabelSource:
     @property
     def meanings(self) -> dict[str, int | None]:
         """What each word means: 1 good, 0 bad, None not checked; of several, the first of these."""
-        kinds = ((self.unchecked, None), (self.bad, 0), (self.good, 1))
-        return {word: meaning for words, meaning in kinds for word in words}
+        checked = dict.fromkeys(self.bad, 0) | dict.fromkeys(self.good, 1)
+        return dict.fromkeys(self.unchecked) | checked
 
 
 @dataclass(frozen=True, slots=True)
@@ -521,21 +521,22 @@ KINDS: dict[Any, str] = {
 def _made(kind: Any, value: Any, where: str) -> Any:
     """Return a value of a TOML file, converted to `kind`, the annotated type of its key.
 
-    A table becomes a dataclass or a dict, and a list a tuple; so does a single value if several are
-    expected. `?` (not known yet) may stand in place of a text, number, boolean or choice, and
-    stays `?`; the key `?` of a mapping is left out. A single value in place of a `Channel` is its
-    unit. Raises DataError for an unknown key or choice, and for a value of another type (see
-    `_as_kind`); `where` is its name in the message.
+    A table becomes a dataclass (`_made_section`) or a dict, and a list a tuple; so does a single
+    value if several are expected. `?` (not known yet) may stand in place of a text, number, boolean
+    or choice, and stays `?`; the key `?` of a mapping is left out. A single value in place of a
+    `Channel` is its unit. Raises DataError for an unknown key or choice, and for a value of another
+    type (see `_as_kind`); `where` is its name in the message.
     """
     origin = get_origin(kind)
     args = get_args(kind)
     if origin is tuple:
         items = value if isinstance(value, list | tuple) else [value]
         return tuple(_made(args[0], item, where) for item in items)
-    if origin is Literal and value != UNKNOWN:
-        expect_one_of(args, str(value), where)
+    if origin is Literal:
+        if value != UNKNOWN:
+            expect_one_of(args, str(value), where)
         return value
-    if origin is Literal or kind in KINDS:
+    if kind in KINDS:
         return _as_kind(kind, value, where)
     if kind is Channel and not isinstance(value, Mapping):
         value = {"unit": value}
@@ -546,6 +547,14 @@ def _made(kind: Any, value: Any, where: str) -> Any:
             for name, item in value.items()
             if name != UNKNOWN
         }
+    return _made_section(kind, value, where)
+
+
+def _made_section(kind: Any, value: Stated, where: str) -> Any:
+    """Return a table of a TOML file as the dataclass `kind`, whose fields are its keys.
+
+    Raises DataError for an unknown key, and as `_made` does; `where` is its name in the message.
+    """
     keys = {about.name: about.type for about in fields(kind) if about.compare}
     for name in value:
         expect_one_of(keys, name, where)
@@ -566,9 +575,8 @@ def _as_kind(kind: Any, value: Any, where: str) -> Any:
         return value
     if kind is str and isinstance(value, int | float):
         return str(value)
-    is_kind = isinstance(value, bool) == (kind is bool) and (
-        isinstance(value, kind) or (kind is float and isinstance(value, int))
-    )
+    wanted = float | int if kind is float else kind
+    is_kind = isinstance(value, bool) == (kind is bool) and isinstance(value, wanted)
     is_finite = kind is not float or (is_kind and abs(value) <= sys.float_info.max)
     expect_data(is_kind and is_finite, f"{KINDS[kind]} in {where}", value)
     return float(value) if kind is float else value
@@ -596,9 +604,9 @@ def _plain(value: Any) -> Any:
         return [*map(_plain, value)]
     if isinstance(value, Mapping):
         return {name: _plain(item) for name, item in value.items()}
-    values = {about.name: getattr(value, about.name) for about in fields(value) if about.compare}
+    names = [about.name for about in fields(value) if about.compare]
     default = type(value)()
-    return {k: _plain(v) for k, v in values.items() if v != getattr(default, k)}
+    return {k: _plain(v) for k in names if (v := getattr(value, k)) != getattr(default, k)}
 
 
 def flat(prefix: str, value: Stated) -> Values:
