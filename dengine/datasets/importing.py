@@ -83,21 +83,29 @@ def check_agreement(data: Dataset, trace_spec: TraceSpec) -> None:
     not compared. Raises SettingError if no `TraceSpec` can be made of the data set (`data.spec`).
     """
     spec = data.spec
-    is_same = (spec.fit == "resample") is (trace_spec.fit == "resample")
-    is_same = is_same and spec.samples == trace_spec.samples
+    forms = [(form.fit == "resample", form.samples) for form in (spec, trace_spec)]
     expect(
-        data.lengths is None or is_same,
+        data.lengths is None or forms[0] == forms[1],
         f"recordings brought to {trace_spec.samples} samples by {trace_spec.fit}",
         (spec.samples, spec.fit),
         "state these in [traces], or what is known would count again",
         TraceError,
     )
     rates = (trace_spec.rate_hz, spec.rate_hz)
-    is_rate = None in rates or math.isclose(*rates, rel_tol=RATE_TOLERANCE)  # type: ignore[arg-type]
-    expect(is_rate, f"traces at {rates[0]} Hz", rates[1], "resample them", TraceError)
+    expect(
+        None in rates or math.isclose(*rates, rel_tol=RATE_TOLERANCE),  # type: ignore[arg-type]
+        f"traces at {rates[0]} Hz",
+        rates[1],
+        "resample them",
+        TraceError,
+    )
     names = trace_spec.columns
-    is_same = spec.columns in ((), names) or not names
-    expect(is_same, f"the channels {', '.join(names)}", spec.columns, "", TraceError)
+    expect(
+        spec.columns in ((), names) or not names,
+        f"the channels {', '.join(names)}",
+        spec.columns,
+        error=TraceError,
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -202,8 +210,9 @@ def import_labelled(
         trace_spec = engine.trace or data.spec
         check_agreement(data, trace_spec)
         traces = as_traces(data.X, trace_spec)
-        decisions = _verifying_decisions(traces, data)
-        parts = [*zip(decisions, traces, map(as_success, data.y), strict=True)]
+        parts = [
+            *zip(_verifying_decisions(traces, data), traces, map(as_success, data.y), strict=True)
+        ]
         report = import_parts(engine.store, parts, trace_spec, engine.policy, on_traces)
     finally:
         if opened is not store:
@@ -274,20 +283,17 @@ def import_parts(
         for decision, trace, label in chunk:
             id_ = decision.id
             earlier = new.get(id_) or store.decisions.get(id_)
-            reported = labels.get(id_) or earlier
-            if reported is not None and reported.source is not None:  # a forgotten one has a label
-                outcome = "repeated" if reported.success in (label, None) else "contradicted"
+            if outcome := _outcome(labels.get(id_) or earlier, label):
                 counts[outcome] += label is not None
                 continue
             stored = earlier
             if stored is None:
-                stored = _as_stored(
+                stored = new[id_] = _as_stored(
                     decision, trace, gate(torch.from_numpy(trace), limit), policy, store.clock()
                 )
-                new[id_] = stored
-            if counts_unreported and decision.action is Action.ACCEPT:
+            if decision.action is Action.ACCEPT:
                 # A decision that was stored without a label was counted as unreported.
-                n_unreported += (label is None) - (earlier is not None)
+                n_unreported += counts_unreported * ((label is None) - (earlier is not None))
             if label is not None:
                 n_since = n_unreported * (not stored.quarantined)
                 n_unreported -= n_since
@@ -307,6 +313,16 @@ def import_parts(
         if on_traces is not None:
             on_traces(len(chunk))
     return ImportReport(**counts, resumed=True)
+
+
+def _outcome(reported: NewLabel | StoredDecision | None, label: bool | None) -> str:
+    """Return "repeated" or "contradicted" for a label of a part that has one; "" if it has none.
+
+    A label that was withdrawn cannot be contradicted.
+    """
+    if reported is None or reported.source is None:  # a forgotten one has a label
+        return ""
+    return "repeated" if reported.success in (label, None) else "contradicted"
 
 
 def _as_stored(
@@ -347,6 +363,10 @@ def _verifying_decisions(traces: TraceArray, data: Dataset) -> Iterator[Decision
     n_equal = Counter[int]()
     parts = [None] * len(data) if data.part is None else data.part.tolist()
     for hash_, part in zip(content_hash(traces).tolist(), parts, strict=True):
-        decision_id = f"import-{hash_ & (2**64 - 1):016x}-{n_equal[hash_]}"
-        yield verify_decision(decision_id, as_part(part), 0, Reason.NO_MODEL)
+        yield verify_decision(
+            f"import-{hash_ & (2**64 - 1):016x}-{n_equal[hash_]}",
+            as_part(part),
+            0,
+            Reason.NO_MODEL,
+        )
         n_equal[hash_] += 1
