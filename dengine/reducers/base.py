@@ -446,10 +446,9 @@ class RowCache:
 
         A row holds values computed from a label's trace, so that they need not be computed again.
         ``compute(index)`` returns the rows that the cache lacks; `index`, a mask (m,) or a slice of
-        all, selects them, perhaps none. `numbers` (m,), at least one, strictly increase and are
-        never -1, which is not checked. `numbers` and the result are kept without a copy: do not
-        change them. If `numbers` is None, all rows are computed, and the cache is neither read nor
-        changed.
+        all, selects them. `numbers` (m,), at least one, strictly increase and are never -1, which
+        is not checked. `numbers` and the result are kept without a copy: do not change them. If
+        `numbers` is None, all rows are computed, and the cache is neither read nor changed.
         """
         if numbers is None:
             return compute(slice(None))
@@ -459,7 +458,8 @@ class RowCache:
             positions = np.searchsorted(self.numbers, numbers)
             is_new = np.append(self.numbers, -1)[positions] != numbers
             positions[is_new] = len(self._rows) + np.arange(is_new.sum())
-            rows = np.concatenate([self._rows, compute(is_new)])
+            # Without new ones nothing is copied: `precompute` has computed them before a retrain.
+            rows = np.concatenate([self._rows, compute(is_new)]) if is_new.any() else self._rows
             # A slice copies nothing; it is enough unless a trace in between has left.
             is_slice = (np.diff(positions) == 1).all()
             self._rows = rows[positions[0] : positions[-1] + 1] if is_slice else rows[positions]

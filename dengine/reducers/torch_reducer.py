@@ -34,6 +34,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812  # PyTorch's own documentation calls it so
 from torch.nn.modules.batchnorm import _BatchNorm
 from torch.nn.utils.rnn import pad_sequence
+from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from ..decision.scripting import (
     arrays_with_prefix,
@@ -447,7 +448,6 @@ class TorchReducer(ProbabilityReducer):
             optimizer.load_state_dict(optimizer.state_dict() | {"state": self.optimizer_state_})
         return optimizer
 
-    @torch.no_grad()
     def average_weights(self) -> None:
         """Move the averaged weights of the networks, in place, towards the trained weights.
 
@@ -457,10 +457,8 @@ class TorchReducer(ProbabilityReducer):
         not averaged.
         """
         kept = min(self.weight_averaging, (1 + self.n_steps_) / (10 + self.n_steps_))
-        for average, current in zip(
-            self.averaged_members_.parameters(), self.members_.parameters(), strict=True
-        ):
-            average.lerp_(current, 1.0 - kept)
+        average = get_ema_multi_avg_fn(kept)  # type: ignore[no-untyped-call]
+        average([*self.averaged_members_.parameters()], [*self.members_.parameters()], None)
 
     @torch.no_grad()
     def estimate_statistics(self, x: Tensor) -> None:
