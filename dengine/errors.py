@@ -26,7 +26,8 @@ PASSWORD = re.compile(
 QUOTES = ("'", '"')
 OPTIONS = "channels?|fit|samples|rate_hz|unit|trigger|alpha|lower_bound|guarantee|stops|audit_rate"
 OPTION = re.compile(
-    rf"(?<![\w=])'[^']*'|(?<!:)\b({OPTIONS})=('[^']*'|\"[^\"]*\"|[\w.]+)|(?<=\()({OPTIONS})=?(?=\))"
+    rf"(?<![\w=])'[^']*'|(?<![:.])(?<!--set )\b({OPTIONS})=('[^']*'|\"[^\"]*\"|[\w.]+)"
+    rf"|(?<=\()({OPTIONS})=?(?=\))"
 )
 TRACE_SPEC = re.compile(r"(?:DataEngine\(trace=)?TraceSpec\(([^()]*)\)\)?")
 MOST = 1000  # characters of a text in which passwords are looked for: URL takes time to search
@@ -73,11 +74,11 @@ def as_options(text: str) -> str:
     `rate_hz=500` becomes `--rate-hz 500`, and a name alone in parentheses, `(samples)`, becomes
     `(--samples)`. Only the names in `OPTIONS` are rewritten (channel, channels, fit, samples,
     rate_hz, unit, trigger, alpha, lower_bound, guarantee, stops, audit_rate), and not after a
-    colon. `TraceSpec(...)` around arguments is dropped, with a `DataEngine(trace=...)` around it,
-    also within quotes. A value in quotes loses them unless a shell needs them. A value that begins
-    neither with a quote nor with a letter, a digit, `_` or a point, like -1, stays with its name as
-    it was. All other text stays, also text in single quotes, which messages use for data, unless a
-    letter, a digit, `_` or `=` stands before the quote.
+    colon, a point or `--set`. `TraceSpec(...)` around arguments is dropped, with a
+    `DataEngine(trace=...)` around it, also within quotes. A value in quotes loses them unless a
+    shell needs them. A value that begins neither with a quote nor with a letter, a digit, `_` or a
+    point, like -1, stays with its name as it was. All other text stays, also text in single quotes,
+    which messages use for data, unless a letter, a digit, `_` or `=` stands before the quote.
     """
 
     def to_option(match: re.Match[str]) -> str:

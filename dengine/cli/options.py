@@ -641,7 +641,7 @@ def parse_stated(items: Iterable[str]) -> Values:
     A value is read as TOML; if it is not valid TOML, it is the text itself. Only the first `=` of
     an item divides it, and white space around the key is removed. If a key comes twice, its last
     value counts. Whether there is such a key is not checked. Raises click.UsageError for an item
-    without `=`.
+    without `=`, and for a list or table that is not valid TOML.
     """
     stated = Values()
     for item in items:
@@ -649,8 +649,14 @@ def parse_stated(items: Iterable[str]) -> Values:
         if not mark:
             raise click.UsageError(f"Expected --set KEY=VALUE, got {item!r}.")
         value: Any = text
-        with suppress(tomllib.TOMLDecodeError):
+        try:
             value = tomllib.loads(f"value = {text}")["value"]
+        except tomllib.TOMLDecodeError:
+            if text.startswith(("[", "{")):
+                raise click.UsageError(
+                    f"Expected TOML in --set {item}: texts in double quotes, and all of it in "
+                    'single ones, as in --set \'label.bad=["crack", "burr"]\'.'
+                ) from None
         stated[name.strip()] = value
     return stated
 

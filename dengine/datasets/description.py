@@ -10,6 +10,7 @@ made of these.
 
 import difflib
 import re
+import shlex
 import sys
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
@@ -429,6 +430,11 @@ class Description:
         return (self.label, *self.check)
 
     @property
+    def listings(self) -> set[str]:
+        """The files that list labels or windows, as paths from the folder; perhaps also ""."""
+        return {self.windows.listing, *(source.listing for source in self.labels)}
+
+    @property
     def is_cut(self) -> bool:
         """Whether long recordings are cut into parts, by the trigger or listing of `[windows]`."""
         return bool(self.windows.trigger or self.windows.listing)
@@ -442,7 +448,7 @@ class Description:
         become faults.
         """
         values = flat("", {**self.to_dict(), "ignored": {}})
-        keys = [k for k, v in values.items() if UNKNOWN in (v if isinstance(v, list) else [v])]
+        keys = [key for key, value in values.items() if is_open(value)]
         return tuple(keys if self.channels else [*keys, "channels"])
 
     def with_values(self, stated: Stated) -> "Description":
@@ -540,7 +546,10 @@ def _made(kind: Any, value: Any, where: str) -> Any:
         return _as_kind(kind, value, where)
     if kind is Channel and not isinstance(value, Mapping):
         value = {"unit": value}
-    expect_data(isinstance(value, Mapping), f"{where} to be a table", value)
+    example = "NAME" if origin is Mapping else fields(kind)[0].name
+    name = where.rpartition(" ")[2]
+    do = f"state keys in it, like {name}.{example}"
+    expect_data(isinstance(value, Mapping), f"{where} to be a table", value, do)
     if origin is Mapping:
         return {
             str(name): _made(args[1], item, f"{where}.{name}")
@@ -566,7 +575,7 @@ def _as_kind(kind: Any, value: Any, where: str) -> Any:
 
     The text `?` stands for a value that the user must still state. `kind` is a type in `KINDS`:
     text, whole number, number, boolean, or whole number or text. A number or boolean becomes a
-    text, as Python writes it (`True`, `nan`), if only a text is expected, and a whole number
+    text, as TOML writes it (`true`, `nan`), if only a text is expected, and a whole number
     becomes a float if a number is expected. Raises DataError for a value of another type; and, if a
     number is expected, for one that is not finite or too large for a float. `where` is the name of
     the key in the message.
@@ -574,7 +583,7 @@ def _as_kind(kind: Any, value: Any, where: str) -> Any:
     if value == UNKNOWN:
         return value
     if kind is str and isinstance(value, int | float):
-        return str(value)
+        return toml_value(value)
     wanted = float | int if kind is float else kind
     is_kind = isinstance(value, bool) == (kind is bool) and isinstance(value, wanted)
     is_finite = kind is not float or (is_kind and abs(value) <= sys.float_info.max)
@@ -623,6 +632,20 @@ def flat(prefix: str, value: Stated) -> Values:
         else:
             items[f"{prefix}{name}"] = item
     return items
+
+
+def is_open(value: Any) -> bool:
+    """Return whether a value of a description is `?`, or a list with `?` in it."""
+    return UNKNOWN in (value if isinstance(value, list) else [value])
+
+
+def as_option(key: str, value: Any) -> str:
+    """Return how a key is stated on the command line, as a shell takes it: `--set order=name`.
+
+    A text is written as it is, and any other value as TOML.
+    """
+    text = value if isinstance(value, str) else toml_value(value)
+    return f"--set {shlex.quote(f'{key}={text}')}"
 
 
 def _toml_key(name: str) -> str:

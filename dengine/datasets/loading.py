@@ -1,6 +1,7 @@
 """`load_dataset`, which reads formats of dengine as they are, other recordings by a description."""
 
 import json
+import shlex
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from importlib.resources import files
@@ -124,7 +125,7 @@ def description_of(
     Parameters
     ----------
     source : path or DataFrame
-        The recordings. They are looked at only if `description` is None.
+        The recordings. They are looked at only if there is no description, or one with `?` in it.
     description : Description, mapping or path, optional
         None: the description that was saved, as `recordings.toml` in the folder or `FILE.toml`
         beside the file.
@@ -132,18 +133,19 @@ def description_of(
         Values of keys like `label.column`. They replace those in a description file, and a proposal
         keeps them. Not used if `description` is a Description or a mapping.
     propose : bool
-        Whether a description is proposed if none was saved; if not, DataError is raised.
+        Whether a description is proposed if none was saved, or one with `?` in it, whose other
+        values the proposal keeps; if not, DataError is raised.
 
     Raises
     ------
     DataError
-        If no description was saved (the message says what to type), none is given for a DataFrame
-        (even with `propose`), the source does not exist, a stated key is unknown or its value of
-        the wrong type, or a description cannot be read or proposed. Without `propose`, too, a
-        proposal is made for the message, and its errors come first.
+        If no description was saved, or one with `?` in it (the message says what to type), none is
+        given for a DataFrame (even with `propose`), the source does not exist, a stated key is
+        unknown or its value of the wrong type, or a description cannot be read or proposed. Without
+        `propose`, too, a proposal is made for the message, and its errors come first.
     SettingError
-        If none was saved, and a stated `windows.trigger`, the condition at which long recordings
-        are cut, is malformed.
+        If a proposal is made, and a stated `windows.trigger`, the condition at which long
+        recordings are cut, is malformed.
     """
     if isinstance(description, Description):
         return description
@@ -156,29 +158,39 @@ def description_of(
             "a description of the table, like the one that describe(table) proposes",
             None,
         )
-        description = saved_description(source)
-        if not description.is_file():
-            proposal = describe(source, stated)
-            if not propose:
-                raise DataError(missing_text(source, proposal))
-            return proposal
-    return Description.load(description).with_values(stated or {})
+        path = saved_description(source)
+    else:
+        path = Path(description)
+    given = stated or {}
+    about = Description()
+    if description is not None or path.is_file():
+        saved = Description.load(path)
+        about = saved.with_values(given)
+        if not saved.open_keys:
+            return about
+    # What an answer to a ? leads to, like a rate, is not in the file.
+    proposal = describe(source, {**about.to_dict(), **given})
+    if propose:
+        return proposal
+    raise DataError(missing_text(source, path, proposal))
 
 
-def missing_text(path: Path, proposal: Description) -> str:
-    """Return the error message for recordings at `path` without a description.
+def missing_text(source: Path, path: Path, proposal: Description) -> str:
+    """Return the error message for recordings without a description at `path`, or one with `?`.
 
-    A description says how recordings are read. The message lists the keys of the proposed one whose
-    value is `?`, so that the user must state it, with the notes on them, and has the commands that
-    show and save the proposal.
+    A description says how the recordings at `source` are read. The message lists the keys of the
+    proposed one whose value is `?`, so that the user must state it, with the notes on them, and has
+    the commands that show and save the proposal.
     """
+    command = f"dengine data {shlex.quote(str(source))}"
+    found, force = ("one with ?", " --force") if path.is_file() else ("none", "")
     keys = proposal.open_keys
+    state = " --set KEY=VALUE" if keys else ""
     questions = "".join(f"\n  {key}: {proposal.notes.get(key, '')}" for key in keys)
-    state = "".join(f" --set {key}=..." for key in keys)
     return (
-        f"Expected the description {saved_description(path)}, found none. Look at the proposal "
-        f"with `dengine data {path}`, and write it with `dengine data {path} --save{state}`."
-        f"{questions and ' Still open:'}{questions}"
+        f"Expected the description {path}, found {found}. Look at the proposal with `{command}`, "
+        f"and write it with `{command} --save{force}{state}`.{questions and ' Still open:'}"
+        f"{questions}"
     )
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from ...errors import DataError, listed
 from ..checks import check_forms
 from ..dataset import Faults, expect_data
-from ..description import UNKNOWN, Clock, Description, Stated, Strings, flat
+from ..description import UNKNOWN, Clock, Description, Stated, Strings, flat, is_open
 from ..read.files import as_source, caught, match_files, natural_key, read_file
 from ..read.frames import read_frame
 from ..read.places import without_suffix
@@ -94,7 +94,7 @@ def describe(source: Any, stated: Stated | None = None) -> Description:
         If the index of a DataFrame is named like one of its columns.
     """
     source = as_source(source)
-    stated = {key: value for key, value in flat("", stated or {}).items() if value != UNKNOWN}
+    stated = {key: value for key, value in flat("", stated or {}).items() if not is_open(value)}
     p = Proposal(stated, Description().with_values(stated))
     check_forms(Clock(), p.description.text)
     if not isinstance(source, Path):
@@ -311,9 +311,11 @@ def propose_tables(p: Proposal, files: Tables) -> None:
     if UNKNOWN in (p.description.layout, *p.description.part.column):
         p.notes["channels"] = "they follow from layout and part.column"
         return
-    p.tables = parts_of(p, files)
+    parts = parts_of(p, files)
+    p.tables = [part for part in parts if not part.damage]
     if not p.tables:
-        raise DataError(f"Expected recordings in {listed(p.names)}, found none.")
+        why = "".join(f" {error}." for part in parts[:1] for error in part.damage[:1])
+        raise DataError(f"Expected recordings in {listed(p.names)}, found none.{why}")
     if p.description.layout != "files":
         p.names = ()
     propose_roles(p)

@@ -3,7 +3,6 @@
 import math
 import re
 from collections.abc import Sequence
-from contextlib import suppress
 from itertools import pairwise
 
 import numpy as np
@@ -12,10 +11,10 @@ from ...errors import listed
 from ...records import Floats
 from ..checks import check_forms
 from ..dataset import LEAST_RATE_HZ, MOST_RATE_HZ, Faults
-from ..description import ANY, UNKNOWN, TextForm
+from ..description import ANY, UNKNOWN, TextForm, as_option
 from ..read.clock import UNITS, check_steps, has_day, scale_of, times_of
 from ..read.files import caught
-from ..table import Table, UnreadableError
+from ..table import Table
 from ..units import quantity_of
 from .columns import FORCES, Column, Proposal, Tables
 
@@ -38,7 +37,8 @@ NAMED_UNIT = re.compile(
     r"|(?P<us>micros)|(?P<s>(?:^|[^a-z])secs?(?:onds?)?$)"
 )
 # Counts since some day: their unit, and the seconds from that day to 1970.
-EPOCHS = {"s": 0, "ms": 0, "us": 0, "ns": 0, "d": 2_209_161_600}  # days since 1900: spreadsheets
+# Spreadsheets count days since 1900, and WinCC a millionth of them.
+EPOCHS = dict.fromkeys(("s", "ms", "us", "ns"), 0) | dict.fromkeys(("d", "0.0864 s"), 2_209_161_600)
 GUESSES = ("s", "ms", "us", "ns", "min", "d", "0.1 us")  # of a unit that nothing states
 YEARS = (946_684_800, 2_524_608_000)  # seconds since 1970 of the years 2000 to 2050
 # Steps between these are taken for seconds: larger ones may be milliseconds of a rate up to 50 kHz,
@@ -72,12 +72,16 @@ def propose_clock(p: Proposal) -> None:
         clocks = [p.columns[name] for name in p.description.time.column]
     if clocks and len(names) < 2:
         p.put("time.column", [column.name for column in clocks])
-        p.put("time.format", [form_of(column, p) for column in clocks])
+        forms = [form_of(column, p) for column in clocks]
+        p.put("time.format", forms)
+        if UNKNOWN in forms and len(forms) > 1:
+            p.notes["time.format"] += f"; state all, like {as_option('time.format', forms)}"
     elif names:
         p.put(
             "time.column",
             UNKNOWN,
-            f"of {listed(names)}: one, several that are added (a date, a time, ms), or []: none; "
+            f"of {listed(names)}: one, several that are added (a date, a time, ms), as in "
+            f"{as_option('time.column', names[:2])}, or []: none; "
             "with time.sort=true if the rows of a part are not in the order of time",
         )
 
@@ -232,24 +236,28 @@ def is_rate(step: float) -> bool:
 def propose_rate(p: Proposal, tables: Tables) -> None:
     """Set `time.rate_hz` in `p`, from the median over the recordings of the mean step of time.
 
-    `p` is the description so far; stated keys stay. `tables` has the samples of each recording.
-    With `time.sort` the times of each are sorted first. Steps below 0 are left out of the mean, and
-    the rate is rounded to five digits. It is `?` (the user must answer), with a note, if it is not
-    between 1 Hz and 1 MHz, like that of times that only fall; then `time.gap`, the longest step
-    that is allowed, is not looked at. Otherwise `check_steps` checks the times, by the rate and the
-    gap that the description has by then. If it refuses more recordings than 10 % plus one,
-    `time.gap` is set to `?`, with a note on the first. If recordings of another length are stated
-    to be resampled (`traces.lengths`), `traces.samples` becomes the number of samples for which
-    99 % of the recordings last; longer ones lose their end when they are read. `order` may follow
-    from the times, also if the rate is `?` (`_order_by_times`). Recordings whose times cannot be
-    read are skipped. Raises DataError if a stated format is no form or unit of times, or if a
-    setting in `[time]` is wrong (see `check_forms`).
+    `p` is the description so far; stated keys stay, and without a column of times nothing is set.
+    `tables` has the samples of each recording. With `time.sort` the times of each are sorted first.
+    Steps below 0 are left out of the mean, and the rate is rounded to five digits. It is `?` (the
+    user must answer), with a note, if it is not between 1 Hz and 1 MHz, like that of times that
+    only fall; then `time.gap`, the longest step that is allowed, is not looked at. Otherwise
+    `check_steps` checks the times, by the rate and the gap that the description has by then. If it
+    refuses more recordings than 10 % plus one, `time.gap` is set to `?`, with a note on the first.
+    If recordings of another length are stated to be resampled (`traces.lengths`), `traces.samples`
+    becomes the number of samples for which 99 % of the recordings last; longer ones lose their end
+    when they are read. `order` may follow from the times, also if the rate is `?`
+    (`_order_by_times`). Recordings whose times cannot be read are skipped. Raises DataError if a
+    stated format is no form or unit of times, or if a setting in `[time]` is wrong (see
+    `check_forms`).
     """
     clock = p.description.time
     check_forms(clock, TextForm())  # the marks in numbers may be ? by now
+    if not clock.column:
+        return
     clocks = list[tuple[Table, Floats]]()
+    unread: Faults = []
     for table in tables:
-        with suppress(UnreadableError):
+        with caught(unread, table.source):
             seconds = times_of(table, clock, p.description.text)
             clocks.append((table, np.sort(seconds) if clock.sort else seconds))
     spans = [(seconds[0], seconds[-1]) for _, seconds in clocks]
@@ -258,12 +266,12 @@ def propose_rate(p: Proposal, tables: Tables) -> None:
     means = [s[s >= 0].mean() for s in steps if (s >= 0).any()]
     usual = float(np.median(means or 0.0))
     if not is_rate(usual):
+        why = [*unread, f"steps of {usual:.6g} s are of no force"][0]
         p.put(
             "time.rate_hz",
             UNKNOWN,
-            f"steps of {usual:.6g} s are of no force: is time.format right? If the newest row is "
-            "the first, state time.sort=true. A footer is left out with text.drop, the words that "
-            "it begins with",
+            f"{why}: is time.format right? If the newest row is the first, state time.sort=true. A "
+            "footer is left out with text.drop, the words that it begins with",
         )
         return
     p.put("time.rate_hz", float(f"{1 / usual:.5g}"))

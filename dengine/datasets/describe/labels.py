@@ -16,10 +16,18 @@ import numpy as np
 
 from ...errors import DataError, listed
 from ..dataset import Faults
-from ..description import SOURCES, UNKNOWN, Description, LabelSource, PartSource, Strings
+from ..description import (
+    SOURCES,
+    UNKNOWN,
+    Description,
+    LabelSource,
+    PartSource,
+    Strings,
+    as_option,
+)
 from ..read.files import caught
 from ..read.places import part_of, read_labels, without_suffix
-from ..table import Table
+from ..table import Table, UnreadableError
 from .columns import MOST_WORDS, Proposal, Tables, counts_of
 
 GOOD = (
@@ -91,7 +99,9 @@ def with_meanings(source: LabelSource, words: Names) -> LabelSource:
     groups: Sequence[Sequence[str]] = (GOOD, BAD, UNCHECKED)
     if lists_words(source) or GOOD_NAME.fullmatch(name):
         groups = ((*GOOD, *YES), (*BAD, *NO), UNCHECKED)
-    goods, bads, others = (tuple(w for w in words if w.lower() in group) for group in groups)
+    stated = source.good + source.bad + source.unchecked
+    free = [word for word in words if word not in stated]
+    goods, bads, others = (tuple(w for w in free if w.lower() in group) for group in groups)
     return replace(
         source,
         good=source.good or goods or (UNKNOWN,),
@@ -191,7 +201,7 @@ def part_words(source: PartSource, tables: Tables) -> Words:
     """
     words = dict[str, str]()
     for table in tables:
-        with suppress(DataError):
+        with suppress(UnreadableError):
             words[table.source] = part_of(source, table)
     return words
 
@@ -247,12 +257,12 @@ def words_of(p: Proposal, source: LabelSource, tables: Tables, parts: Words) -> 
 
 
 def title_of(source: LabelSource, words: Words) -> str:
-    """Return a text with the keys that state a source, like `label.column=result`.
+    """Return a text with the options that state a source, like `--set label.column=result`.
 
     In brackets follows how often each word comes. `words` has the word of each recording.
     """
     stated = Description(label=source).to_dict()["label"]
-    keys = [f"label.{key}={value}" for key, value in stated.items() if isinstance(value, str)]
+    keys = [as_option(f"label.{k}", text) for k, text in stated.items() if isinstance(text, str)]
     return f"{' '.join(keys)} ({counts_of(words.values())})"
 
 
@@ -406,9 +416,16 @@ def propose_label(p: Proposal) -> None:
         return
     label = (certain or named)[0]
     words = counted[label]
-    checks = tuple(source for source in certain[1:] if counted[source].keys() >= words.keys())
-    p.description = replace(p.description, label=label, check=p.description.check or checks)
+    others = [source for source in certain[1:] if counted[source].keys() >= words.keys()]
+    p.description = replace(p.description, label=label)
+    propose_checks(p, others)
     note_words(p, words)
+
+
+def propose_checks(p: Proposal, sources: Sequence[LabelSource]) -> None:
+    """Set `[[check]]` in `p`, the sources that must agree with the label, unless it is stated."""
+    if not (p.description.check or "check" in p.stated):
+        p.description = replace(p.description, check=tuple(sources))
 
 
 def note_words(p: Proposal, words: Words) -> None:

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 from ...errors import DataError, listed
-from ..description import ANY, UNKNOWN, Channel, TextForm
+from ..description import ANY, UNKNOWN, Channel, TextForm, as_option
 from ..read.split import OBJECTS, longest_list, split
 from ..table import Table
 from .clock import CLOCK_NAME, are_even
@@ -89,7 +89,9 @@ def _propose_part_column(p: Proposal, columns: Iterable[Column], runs: Sequence[
     parts = [c for c in runs if PART_NAME.search(c.name) and c.n_runs >= least]
     likely = [c.name for c in parts if len(c.counts) == c.n_runs]
     named = [c.name for c in columns if PART_NAME.search(c.name) or has_long_runs(c)]
-    note = f"one of {listed(named)}, or several"
+    note = f"one of {listed(named)}, or several, like {as_option('part.column', named[:2])}"
+    if len(p.names) > 1:
+        note += "; or layout=files: each file is a part"
     p.put("part.column", *(likely if len(likely) == 1 else (UNKNOWN, note)))
 
 
@@ -166,7 +168,7 @@ def parts_of(p: Proposal, files: Tables) -> list[Table]:
         description = replace(description, channels=dict.fromkeys(patterns, Channel()))
     parts = list[Table]()
     for table in files:
-        of_file = [part for part in split(table, description) if not part.damage]
+        of_file = [*split(table, description)]
         is_cut = p.is_cut and layout == "long" and len(of_file) > 1
         parts += of_file[: len(of_file) - is_cut]
     return parts[:MOST_PARTS]

@@ -6,6 +6,7 @@ from contextlib import suppress
 from dataclasses import replace
 from itertools import groupby, zip_longest
 from operator import itemgetter
+from pathlib import PurePath
 from typing import Any
 
 from ...errors import DataError, listed
@@ -28,6 +29,7 @@ MARK = re.compile(r"[-_. :T/]?")  # between the numbers of a date
 DAY_FIRST = re.compile(
     r"[0-3]?\d[0-3]\d(20)?[0-4]\d[0-2]\d[0-5]\d([0-5]\d)?|[0-3]?\d[0-3]\d20[0-4]\d"
 )
+MOST_GAPS = 10  # numbers that a counter may leave out for each that it has
 RENAME = "rename the files"
 
 
@@ -37,7 +39,8 @@ def propose_order(p: Proposal) -> None:
     `p` is the description so far. The files are sorted by path without the words in it that are
     labels; in the layout `columns` the columns' names count in place of files, as they stand. If
     this proves the order (`proves_order`), it is `name` if file names give the same order, else
-    `path`; if not, it is `?`, with a note. While `label.column` is `?`, paths are not looked at.
+    `path`; if not, it is `name` if the names without folders prove it, else `?`, with a note. While
+    `label.column` is `?`, paths are not looked at.
 
     In this order, or by name if it is not proved, parts are then compared. `order` is also `?` if
     part numbers, dates, times or counters of the recordings have another order (`unsorted_places`);
@@ -52,12 +55,13 @@ def propose_order(p: Proposal) -> None:
         by_path = sorted(stems, key=lambda path: natural_key(stems[path]))
         by_name = sorted(stems, key=file_key)
     files = by_name
+    names = [PurePath(stems[path]).name for path in by_name]
     # While it is open where the label stands, any folder or word may be one of a verdict.
     is_known = about.label.column != UNKNOWN
     if is_known and proves_order([stems[path] for path in by_path]):
         files = by_path
         p.put("order", "name" if by_path == by_name else "path")
-    elif is_known:
+    elif is_known and not (len({*names}) > 1 and proves_order(names)):
         p.put(
             "order",
             UNKNOWN,
@@ -67,7 +71,7 @@ def propose_order(p: Proposal) -> None:
     places = {path: place for place, path in enumerate(files)}
     tables.sort(key=lambda table: places[table.path])
     for place, other in unsorted_places(p, tables):
-        p.put("order", UNKNOWN, f"name, or {other}: {place} has another order")
+        p.put("order", UNKNOWN, f"name, or {other}: {place} may have another order")
 
 
 def proves_order(names: Strings) -> bool:
@@ -75,25 +79,35 @@ def proves_order(names: Strings) -> bool:
 
     Dates (`find_date`) must never fall. If the names first differ in the date, the names of one
     date must prove their order, too. If they first differ in another number, it must be distinct in
-    each name and rise, and so must any other number that is distinct in each. 31.12.2025 is read
-    with the year first; other numbers with the day first (010324080000), and AM and PM, prove
-    nothing. If all names are equal, no other order is possible.
+    each name and rise with few gaps (`may_count`), and any other number that is distinct in each
+    must rise. 31.12.2025 is read with the year first; other numbers with the day first
+    (010324080000), and AM and PM, prove nothing. If all names are equal, no other order is
+    possible.
     """
-    if len({*names}) == 1:
-        return True
     pieces = [*zip_longest(*map(natural_key, names), fillvalue="")]
+    first = next((i for i, row in enumerate(pieces) if len({*row}) > 1), None)
+    if first is None:
+        return len({*names}) == 1  # unlike 1 and 01
     date = find_date(pieces)
     dates = [*zip(*pieces[date.start : date.stop : 2], strict=True)]
     if dates != sorted(dates) or any(map(HALF_DAY.search, names)):
         return False
-    first = next(i for i, row in enumerate(pieces) if len({*row}) > 1)
     if first in date:
         days = groupby(zip(dates, names, strict=True), itemgetter(0))
         return all(proves_order([*map(itemgetter(1), day)]) for _, day in days)
     numbers = pieces[1 : date.start : 2] + pieces[date.stop + 1 :: 2]
     counters = [row for row in numbers if len({*row, ""}) > len(names)]
     is_odd = any([*row] != sorted(row) or fits_all(DAY_FIRST, row) for row in counters)
-    return pieces[first] in counters and not is_odd
+    return pieces[first] in counters and not is_odd and may_count(pieces[first])
+
+
+def may_count(numbers: Sequence[int]) -> bool:
+    """Return whether numbers in names may count: their range is below ten times how many they are.
+
+    Random numbers, serial numbers with gaps and times of day are seldom so; seconds since 1970 and
+    the like (`STAMP`) may.
+    """
+    return max(numbers) - min(numbers) < MOST_GAPS * len(numbers) or fits_all(STAMP, numbers)
 
 
 def find_date(pieces: Sequence[Any]) -> range:
@@ -133,6 +147,8 @@ def is_out_of_order(words: Strings, place: str, is_fixed: bool) -> bool:
     words : the word of each recording, in the order to be compared. place : the name of their
     place. is_fixed : whether the place has one word for each recording.
     """
+    if len({*words}) == 1:
+        return False
     ranks = [*map(sort_key, words)]
     is_sorted = ranks == sorted(ranks)
     if all(map(STAMP.match, words)) or (
@@ -141,10 +157,18 @@ def is_out_of_order(words: Strings, place: str, is_fixed: bool) -> bool:
         return not is_sorted or any(map(is_unsorted, words))
     if is_sorted or not is_fixed or len({*words}) < len(words):
         return False
+    return words == sorted(words) or ranks == sorted(ranks, reverse=True) or _count(ranks)
+
+
+def _count(ranks: Sequence[Any]) -> bool:
+    """Return whether the last numbers in words, of which `sort_key` gives the ranks, count them.
+
+    They are more than two different whole numbers, and their range is below twice how many they
+    are.
+    """
     counts = [rank[-2] for rank in ranks if len(rank) > 1]
-    is_count = len({*counts}) == len(words) > 2 and not any(n % 1 for n in counts)
-    is_dense = is_count and max(counts) - min(counts) < 2 * len(words)
-    return words == sorted(words) or ranks == sorted(ranks, reverse=True) or is_dense
+    is_whole = len({*counts}) == len(ranks) > 2 and not any(n % 1 for n in counts)
+    return is_whole and max(counts) - min(counts) < 2 * len(counts)
 
 
 def unsorted_places(p: Proposal, tables: Tables) -> Iterator[tuple[str, str]]:
@@ -162,6 +186,17 @@ def unsorted_places(p: Proposal, tables: Tables) -> Iterator[tuple[str, str]]:
     parts = part_words(part, tables)
     if is_out_of_order([*parts.values()], "part", True):
         yield "part", listed(part.column) or RENAME
+    for source in _sources(p):
+        words = [*filter(None, words_of(p, source, tables, parts).values())]
+        is_column = source.column and not source.listing
+        place = source.column or source.line
+        if is_out_of_order(words, place, not is_column or bool(p.columns[source.column].fixed)):
+            can_sort = is_column and not any(map(is_unsorted, words))
+            yield place, source.column if can_sort else RENAME
+
+
+def _sources(p: Proposal) -> list[LabelSource]:
+    """Return the places where words may rise from recording to recording, see `unsorted_places`."""
     sources = [LabelSource(column=column.name, at="first") for column in p.unused]
     sources += [LabelSource(line=line) for line in lines_of(p)]
     for label in p.description.labels:
@@ -169,9 +204,4 @@ def unsorted_places(p: Proposal, tables: Tables) -> Iterator[tuple[str, str]]:
             sources += [
                 replace(label, column=name) for name in p.read_listing(label.listing).columns
             ]
-    for source in sources:
-        words = [*filter(None, words_of(p, source, tables, parts).values())]
-        is_column = source.column and not source.listing
-        place = source.column or source.line
-        if is_out_of_order(words, place, not is_column or bool(p.columns[source.column].fixed)):
-            yield place, source.column if is_column else RENAME
+    return sources

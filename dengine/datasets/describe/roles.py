@@ -15,6 +15,7 @@ from ..description import (
     UNKNOWN,
     PartSource,
     RowWords,
+    as_option,
     expect_one_of,
 )
 from ..read.files import natural_key
@@ -50,7 +51,8 @@ SCALE_NAME = re.compile(
 SET_VALUE = re.compile(
     WORD_BEGINS
     + r"(set|vorgabe|nominal|target|consigne|max|min|limit|(cmd|des|ref)(?![a-z])|comm?and"
-    r"|desired|demand)|soll|grenz"
+    r"|desired|demand|(err|est|std|sim|dot|diff|calc)(?![a-z])|error|model|estimate|predict|bias"
+    r"|drift|offset)|soll|grenz|abweich"
 )
 ANY_NAME = re.compile("")
 
@@ -73,7 +75,7 @@ def propose_roles(p: Proposal) -> None:
     malformed `windows.trigger`.
     """
     p.columns = columns_of(p.tables, p.description.text)
-    for name in (*p.description.time.column, *p.description.channels):
+    for name in (*p.description.time.column, *p.description.channels, *p.description.rows):
         expect_one_of(p.columns, name, "the columns")
     complete_rows(p)
     propose_clock(p)
@@ -91,8 +93,7 @@ def propose_roles(p: Proposal) -> None:
         propose_lengths(p)
     if p.description.order == "name" and "order" not in p.stated and UNKNOWN not in clock.column:
         propose_order(p)
-    listings = {source.listing for source in p.description.labels}
-    others = sorted({*p.others} - listings, key=natural_key)
+    others = sorted({*p.others} - p.description.listings, key=natural_key)
     if UNKNOWN not in p.description.exclude and others:
         p.put("exclude", others)
     p.put("ignored", {column.name: column.unit for column in p.unused})
@@ -105,12 +106,16 @@ def complete_rows(p: Proposal) -> None:
     place if they are more than 12, and nothing if `*` is stated. Rows that are no samples are left
     out of `p.tables` and `p.columns`; a recording keeps all rows if it lacks a column of `[rows]`.
     But a recording with one cell in such a column is left out as a whole if the word of this cell
-    drops it; if that leaves out all recordings, all of them stay.
+    drops it; if that leaves out all recordings, all of them stay. Raises DataError if none of the
+    stated words of a column comes in it.
     """
     rows = dict(p.description.rows)
     for name in rows.keys() & p.columns.keys():
         about = rows[name]
         words = sorted(p.columns[name].counts)
+        stated = about.keep + about.drop + about.invalid
+        if stated and {*stated}.isdisjoint([*words, ANY]):
+            expect_one_of(words, stated[0], f"rows.{name}")
         others = tuple(word for word in words if about.kinds([word]) == [""])
         if len(others) > MOST_WORDS:
             others = (ANY,)
@@ -170,7 +175,8 @@ def may_qualify(column: Column, n_rows: int) -> bool:
     recording that has the column. It must be a status (`is_status`), or have 1 to 12 different
     texts, perhaps beside numbers, like `Max` in a footer, and no times, and it must change within a
     recording. If it does not, there must be several words, of which one names a force or a torque,
-    or it must be named like a status (`Status`, `valid`) and have just one word in all.
+    or it must be named like a status (`Status`, `valid`), a unit or a factor and have just one word
+    in all: recordings with another one become faults.
     """
     words = column.counts
     is_text = 0 < len(texts_of(column)) <= MOST_WORDS
@@ -181,7 +187,7 @@ def may_qualify(column: Column, n_rows: int) -> bool:
         return is_status(column) or is_phase(column) or (is_text and not is_time)
     if len(words) > 1:
         return any(map(SIGNAL.fullmatch, words))
-    return QUALIFIER_NAME.search(column.name) is not None
+    return bool(QUALIFIER_NAME.search(column.name) or SCALE_NAME.search(column.name))
 
 
 def is_phase(column: Column) -> bool:
@@ -215,11 +221,11 @@ def propose_part(p: Proposal) -> None:
     first table. If several qualify, nothing is set. If none does, but in a table with a row for
     each part such a column or line has several words, at most half as many as rows, and `[rows]`,
     which says what rows are kept, is empty, `part.column` is `?`, with a note: the rows may be
-    pieces of a curve. A `[part]` that is set already stays. Raises SettingError for a malformed
-    `windows.trigger`.
+    pieces of a curve. A `[part]` that is set or stated already stays. Raises SettingError for a
+    malformed `windows.trigger`.
     """
     about = p.description
-    if about.part != PartSource():
+    if about.part != PartSource() or "part.column" in p.stated:
         return
     counts = {
         source: len({*part_words(source, p.tables).values()})
@@ -256,7 +262,9 @@ def propose_channels(p: Proposal, units: Mapping[str, str]) -> None:
     if len(best) == 1 and not doubts:
         p.put("channels", {best[0]: units[best[0]]})
         return
-    text = f"one or several of: {listed(units)}" if units else "no column has numbers that change"
+    text = "no column has numbers that change"
+    if units:
+        text = f"--set channels.COLUMN=UNIT for one or several of: {listed(units)}"
     keys = ("channels", f"channels.{UNKNOWN}")
     p.notes |= dict.fromkeys(keys, "; ".join([text, *doubts]))
 
@@ -286,7 +294,7 @@ def _doubt_on(p: Proposal, name: str) -> str:
     description so far, and `p.tables` are the recordings that are looked at.
     """
     if SET_VALUE.search(name):
-        return f"{name} may be a set value"
+        return f"{name} may be no measurement, but a set value, a limit or an error"
     names = p.tables[0].origin.get(name, ()) if p.tables else ()
     numbers = [match[1] for match in match_numbered(name, names)]
     if not numbers or is_numbering(numbers):
@@ -349,8 +357,9 @@ def find_lost(p: Proposal) -> None:
         p.put(
             "text.missing",
             UNKNOWN,
-            f"do these mean a lost sample? {counts_of(strange)}; if so state "
-            f"{[*sorted(missing), *strange]}, else {sorted(missing)}; rows of another signal: "
+            f"do these mean a lost sample? {counts_of(strange)}; if so "
+            f"{as_option('text.missing', [*sorted(missing), *strange])}, else "
+            f"{as_option('text.missing', sorted(missing))}; rows of another signal: "
             "rows.COLUMN.drop, and channels.COLUMN",
         )
 

@@ -19,7 +19,7 @@ import numpy as np
 
 from ...errors import DataError, listed
 from ..dataset import Faults
-from ..description import UNKNOWN, Stated, Strings, TextForm
+from ..description import UNKNOWN, Stated, Strings, TextForm, as_option
 from ..read.files import caught
 from ..read.text import BLANK, COMMENT, LATIN, header_names, split_line, to_utf8, to_utf8_or_latin
 from ..table import pattern_of
@@ -182,10 +182,12 @@ def _head_lines(rows: Rows, width: int, stated: Stated) -> tuple[int, int]:
     A candidate for either is a line of at least `width` cells, the number of columns, of which one
     is neither empty nor a row of dashes. The header is the last candidate; but if more than half of
     its cells are units, and there is an earlier candidate, it is the line of the units, and the one
-    before it the header. Raises DataError if either of two candidates may be the header: if the
-    first has nothing but units; or if the last has a unit, or a name twice, and the one before no
-    empty cell. But not if `stated`, the keys that the user gave, has `text.header` (its value is
-    not used here).
+    before it the header. So it is if the last has no more than comments on names and units directly
+    above each other: the candidate before it has nothing but units, and the line before that is a
+    candidate, too. Otherwise DataError is raised if several candidates may be the header: if the
+    one before the last has nothing but units; or if the last has a unit, or a name twice, and the
+    one before no empty cell. But not if `stated`, the keys that the user gave, has `text.header`
+    (its value is not used here).
 
     rows : the cells of the lines above the samples.
     """
@@ -197,19 +199,22 @@ def _head_lines(rows: Rows, width: int, stated: Stated) -> tuple[int, int]:
     header, units = max(heads, default=0), 0
     if len(heads) > 1:
         above, last = (rows[i - 1] for i in heads[-2:])
-        names = [*filter(None, last)]
-        share = _share_of_units(names)
-        is_odd = share or len({*names}) < len(names)
-        if share > HALF:
+        if _share_of_units(last) > HALF:
             header, units = heads[-2:]
-        elif "text.header" not in stated and (
-            _share_of_units(above) == 1 or (is_odd and all(above))
-        ):
+        elif _share_of_units(above) == 1 and heads[-3:-2] == [heads[-2] - 1]:
+            header, units = heads[-3:-1]
+        elif "text.header" not in stated and _is_doubtful(above, last):
             raise DataError(
-                f"Expected one line of names, lines {heads[-2]} and {header} may be; state "
-                "text.header."
+                f"Expected one line of names, lines {listed(heads)} may be; state text.header."
             )
     return header, units
+
+
+def _is_doubtful(above: Strings, last: Strings) -> bool:
+    """Return whether either of two lines of cells may be the header, see `_head_lines`."""
+    names = [*filter(None, last)]
+    is_odd = _share_of_units(last) > 0 or len({*names}) < len(names)
+    return _share_of_units(above) == 1 or (is_odd and all(above))
 
 
 def _share_of_units(row: Strings) -> float:
@@ -224,12 +229,13 @@ def propose_form(p: Proposal, contents: Mapping[str, bytes], faults: Faults) -> 
     `p` is the description so far, and `[text]` its section on how text files are written. Files
     with another delimiter, number of columns or header are left out: they move from `p.names` to
     `p.others`. If two of them have the same form, or the name of one differs by a number only from
-    that of a file in the result, `exclude` (the patterns of files that are no recordings) is set to
-    `?` (the user must answer), with a note that asks whether they are recordings. For a file that
-    is no text, or whose header is not certain, a fault (why it cannot be read) is appended to
-    `faults`, and it stays in `p.names`; if more than half are such, nothing is set, and the result
-    is empty. Of equally frequent forms that of the file with the most cells counts. Keys that the
-    user stated stay. Raises LookupError for a stated encoding that Python does not know.
+    that of a file in the result (stated listings aside), `exclude` (the patterns of files that are
+    no recordings) is set to `?` (the user must answer), with a note that asks whether they are
+    recordings. For a file that is no text, or whose header is not certain, a fault (why it cannot
+    be read) is appended to `faults`, and it stays in `p.names`; if more than half are such, nothing
+    is set, and the result is empty. Of equally frequent forms that of the file with the most cells
+    counts. Keys that the user stated stay. Raises LookupError for a stated encoding that Python
+    does not know.
 
     contents : the contents of the files that are looked at, by name.
     """
@@ -244,13 +250,15 @@ def propose_form(p: Proposal, contents: Mapping[str, bytes], faults: Faults) -> 
         [(forms[name], len(item.rows) * item.width) for name, item in looks.items()]
     )
     same = [name for name, form in forms.items() if form == usual]
-    odd = {name: form for name, form in forms.items() if form != usual}
-    p.set_aside([*odd])
+    odd = forms.keys() - same
+    p.set_aside(sorted(odd))
+    odd -= p.description.listings
     without_numbers = partial(DIGITS.sub, "0")
-    if len({*odd.values()}) < len(odd) or (
+    if len({*map(forms.get, odd)}) < len(odd) or (
         {*map(without_numbers, odd)} & {*map(without_numbers, same)}
     ):
-        p.put("exclude", UNKNOWN, f"are {listed(odd)} recordings of another form? See files")
+        option = as_option("exclude", sorted(odd))
+        p.put("exclude", UNKNOWN, f"recordings of another form? If not: {option}; if so, see files")
     _propose_keys(p, [looks[name] for name in same])
     return same
 
