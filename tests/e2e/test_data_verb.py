@@ -1,8 +1,6 @@
 """`dengine data`, which describes recordings, and the other verbs, which read by that."""
 
-import shutil
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,17 +18,11 @@ def shown(*words: object) -> str:
     return " ".join(result.stdout.split())
 
 
-@pytest.fixture(scope="module")
-def recorded(tmp_path_factory):
-    """24 recordings as UR cells make them, one of them broken."""
-    path = tmp_path_factory.mktemp("recorded")
-    write_sample(path, 24)
-    return path
-
-
 @pytest.fixture
-def folder(recorded, tmp_path):
-    return Path(shutil.copytree(recorded, tmp_path / "cell_3"))
+def folder(tmp_path):
+    """24 recordings as UR cells make them, one of them broken."""
+    write_sample(tmp_path / "cell_3", 24)
+    return tmp_path / "cell_3"
 
 
 def test_a_proposal_is_shown_read_and_drawn_but_written_only_when_asked(folder, tmp_path):
@@ -66,19 +58,20 @@ def test_sample_recordings_are_written_into_a_new_or_an_empty_folder_alone(folde
     assert sorted(folder.iterdir()) == before
 
 
-def test_open_keys_are_listed_and_a_check_fails(tmp_path):
-    np.savez(tmp_path / "parts.npz", a=5, b=2.0)
-    assert "layout: " in shown("data", tmp_path / "parts.npz")
-    refused("data", tmp_path / "parts.npz", "--check")
+def test_open_keys_are_listed_a_check_fails_and_a_saved_answer_has_its_consequences(tmp_path):
+    for last, name in enumerate(("1_OK.csv", "2_NOK.csv")):
+        (tmp_path / name).write_text(f"t,F\n0,5\n2,7\n4,3\n6,{last}\n")
+    assert "time.format: " in shown("data", tmp_path, "--save")
+    refused("data", tmp_path, "--check")
+    assert "found one with ?" in refused("replay", "--data", tmp_path)
+    assert "rate_hz = 500.0" in shown("data", tmp_path, "--set", "time.format=ms")
 
 
 def test_a_check_ends_with_1_if_there_is_a_fault_and_names_it(folder):
     shown("data", folder, "--save")
     refused("data", folder, "--check", "--json")
-    faults = load_dataset(folder).faults
-    assert faults
-    for fault in faults:
-        (folder / fault.source).unlink()
+    (fault,) = load_dataset(folder).faults
+    (folder / fault.source).unlink()
     assert "made for" in shown("data", folder, "--check")
 
 

@@ -369,6 +369,8 @@ def test_a_damaged_description_is_refused(line, tmp_path):
 STATED = """
 channels.forc=N                in the columns, got 'forc'
 time.column=tmie               Expected 'time' in the columns
+channels=FZ                    keys in it, like channels.NAME
+rows.tmie.keep=*               in the columns, got 'tmie'
 label.column=other             where [label] says they stand
 label.path=(                   a regular expression with one group
 label.listing=x.csv            label.key
