@@ -213,7 +213,7 @@ class CostCurve:
         sizes = [
             Z**2 * error.upper * (1.0 - error.upper) / (error.upper - rate) ** 2
             if rate < 1.0
-            else float(error.traces)
+            else error.traces
             for error, rate in zip(errors, rates, strict=True)
         ]
 
@@ -738,14 +738,14 @@ def curve_of(
     """Return what a part costs under some policies at these prices, and which policy to choose.
 
     `groups` has each policy (settings of the rule that decides) with its replays (runs over
-    recorded parts), all of the same shuffles (random orders of the recordings) in the same order.
-    The choice is the cheapest policy, or one that accepts fewer bad parts and is not significantly
-    dearer; but it is "check everything" if that policy is not cheaper than a check of every part
-    (`_choose` has the exact rule). It is made again with each price halved and doubled; choices
-    that differ are in the field `price_changes` of the result. Three arguments become fields of the
-    result: `left_behind`, the policies that were dearer in earlier shuffles; `out_of_reach`,
-    policies that were not played, each with the reason; and `fresh`, whether no policy was chosen
-    by these shuffles.
+    recorded parts), all of the same two or more shuffles (random orders of the recordings) in the
+    same order. The choice is the cheapest policy, or one that accepts fewer bad parts and is not
+    significantly dearer; but it is "check everything" if that policy is not cheaper than a check of
+    every part (`_choose` has the exact rule). It is made again with each price halved and doubled;
+    choices that differ are in the field `price_changes` of the result. Three arguments become
+    fields of the result: `left_behind`, the policies that were dearer in earlier shuffles;
+    `out_of_reach`, policies that were not played, each with the reason; and `fresh`, whether no
+    policy was chosen by these shuffles.
     """
     rows, marked, verdict = _choose(groups, costs)
     chosen = _chosen_name(marked, verdict)
@@ -821,7 +821,6 @@ def _policy_cost(policy: Policy, replays: Sequence[Replay], costs: Costs) -> Pol
     rejected, and the shares of wrong decisions (bad parts among the accepted ones, good parts among
     the rejected ones). All replays are equally long; the prices are `costs`.
     """
-    n = len(replays)
     verified, accepted, rejected = (
         float(np.mean([getattr(replay, name) for replay in replays]))
         for name in ("verified", "accepted", "rejected")
@@ -831,7 +830,8 @@ def _policy_cost(policy: Policy, replays: Sequence[Replay], costs: Costs) -> Pol
     cost_at = partial(costs.of_part, accepted, rejected)
     of_parts = np.array([part_costs(replay, costs) for replay in replays])  # (shuffles, cycles)
     cost = float(of_parts.mean())
-    luck = float(student.ppf(1.0 - ERROR_LEVEL / 2, max(1, n - 1))) * _order_error(of_parts.mean(1))
+    quantile = float(student.ppf(1.0 - ERROR_LEVEL / 2, len(replays) - 1))
+    luck = quantile * _order_error(of_parts.mean(1))
     return PolicyCost(
         policy=policy,
         expected_cost=cost_at(_expected_rate(bad), _expected_rate(good)),
@@ -859,8 +859,8 @@ def _expected_rate(error: ErrorRate) -> float:
 
 
 def _order_error(means: Floats) -> float:
-    """Return the standard error of a mean over shuffles, from the mean of each; 0 for one."""
-    return float(means.std(ddof=1)) / math.sqrt(len(means)) if len(means) > 1 else 0.0
+    """Return the standard error of a mean over two or more shuffles, from the mean of each."""
+    return float(means.std(ddof=1)) / math.sqrt(len(means))
 
 
 def _difference(

@@ -347,7 +347,10 @@ class HttpApi:
         """Return one decision with its label; 404 for an unknown id, 422 for an invalid one, 503 if
         the queue is full or the id cannot be looked up.
         """
-        return await self._find(id_)
+        stored = await self.service.find(id_)
+        if stored is None:
+            raise unknown_decision(id_)
+        return stored
 
     async def decisions(
         self,
@@ -386,7 +389,7 @@ class HttpApi:
             return list(islice(decisions, limit + 1))
 
         if before:
-            await self._find(before)
+            await self.decision(before)  # raises if there is none
         stored = await self.service.read(read_newest)
         page = stored[:limit]
         return {
@@ -499,18 +502,6 @@ class HttpApi:
     async def docs(self) -> Response:
         """Return the OpenAPI document as a page."""
         return FileResponse(STATIC / "docs.html")
-
-    async def _find(self, id_: str) -> StoredDecision:
-        """Return the stored decision with this id, with its trace and label.
-
-        The request waits in the queue for the engine. Raises UnknownDecisionError for an unknown
-        id, ReportError for an invalid one, StoreError if it cannot be looked up or its trace is
-        damaged, and BusyError if the queue is full or the service is closing.
-        """
-        stored = await self.service.find(id_)
-        if stored is None:
-            raise unknown_decision(id_)
-        return stored
 
     async def _change(self, author: str, work: Callable[[DataEngine, str], Changed]) -> Changed:
         """Call `work` in the engine's thread with the engine and the author, and return its

@@ -139,7 +139,7 @@ class Metrics:
             ("waiting", "Requests in the queue.", service.waiting),
         )
         for name, description, value in gauges:
-            yield GaugeMetricFamily(f"dengine_{name}", description, value=float(value))
+            yield GaugeMetricFamily(f"dengine_{name}", description, value=value)
         yield CounterMetricFamily(
             "dengine_late", "Decisions verified because the deadline passed.", value=service.late
         )

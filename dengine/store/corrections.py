@@ -138,11 +138,11 @@ class CorrectionTable(CellTable):
         query = (
             sa.select(*CORRECTION.c, *LABEL.c["seq", "content_hash"])
             .select_from(CORRECTION.join(LABEL, CORRECTION_OF_LABEL))
-            .where(self._scope.shared(CORRECTION.c.cell_id), CORRECTION.c.number > int(after))
+            .where(self._scope.shared(CORRECTION.c.cell_id), CORRECTION.c.number > after)
         )
         return [
             from_row(Correction, row._mapping)
-            for row in self._database.read(query.order_by(CORRECTION.c.number))
+            for row in self._read(query.order_by(CORRECTION.c.number))
         ]
 
     def insert(

@@ -179,9 +179,9 @@ def prepare_tables(connection: sa.Connection, cell_id: str, name: str) -> None:
         cell.
     """
     lock(connection, TABLES)  # two cells may create them at the same moment
-    tables = set(sa.inspect(connection).get_table_names())
+    tables = sa.inspect(connection).get_table_names()
     # A file belongs to one program; a PostgreSQL database may hold other tables beside ours.
-    if tables & set(METADATA.tables) or (tables and connection.dialect.name == "sqlite"):
+    if METADATA.tables.keys() & tables or (tables and connection.dialect.name == "sqlite"):
         _add_columns(connection)
         check_schema(connection, name)
     else:

@@ -45,7 +45,7 @@ class SettingTable(CellTable):
         read. After these errors nothing is changed. A product stays locked (`lock`) until the
         transaction ends.
         """
-        for key in sorted(settings.keys() & set(RESERVED)):
+        for key in sorted(settings.keys() & RESERVED):
             raise StoreError(
                 f"Expected settings of the engine, got {key!r}, which is the store's; rename it."
             )
