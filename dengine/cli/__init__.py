@@ -80,9 +80,9 @@ class Verbs(click.Group):
             raise
         # UnicodeError: a file name that no file system can have.
         except (DengineError, OSError, UnicodeError) as error:
-            kind = click.ClickException
-            if isinstance(error, ImportRefusedError):
-                kind = click.UsageError
+            kind = (
+                click.UsageError if isinstance(error, ImportRefusedError) else click.ClickException
+            )
             text = " ".join(str(error).split())
             raise kind(as_options(without_password(text))) from error
         except click.ClickException as error:

@@ -91,14 +91,13 @@ def _change_and_print(
     with DataEngine.open(store, wait=LONG_WAIT, allow_import=allow_import) as engine:
         changed = change(engine, author)
         certificate = engine.certificate()
-        policy = engine.policy
     event = ""
     if changed.event is not None:
         event = f" Event {changed.event}, by {author or 'nobody named'}."
     print_result(
         {"store": store, "author": author, "changed": changed.event is not None}
         | asdict(changed)
-        | {"policy": policy, "certificate": certificate_record(certificate)},
+        | {"policy": engine.policy, "certificate": certificate_record(certificate)},
         f"{changed.text}{event}",
     )
 

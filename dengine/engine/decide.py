@@ -157,7 +157,7 @@ class DecisionMaker:
         self,
         x: TraceArray,
         part: str | None,
-        decision_id: str | None = None,
+        decision_id: str | None,
         verify_reason: Reason | None = None,
     ) -> StoredDecision:
         """Decide on one trace and record the decision, without waiting for the disk.
@@ -251,8 +251,8 @@ class DecisionMaker:
         x: TraceArray,
         part: str | None,
         model: EngineModel | None,
-        verify_reason: Reason | None = None,
-        decision_id: str | None = None,
+        verify_reason: Reason | None,
+        decision_id: str | None,
     ) -> StoredDecision:
         """Decide on one trace by a model; return the decision as a record that is not stored yet.
 

@@ -357,11 +357,10 @@ class LiveModel:
         trace is damaged, an event in the store's log says so. Raises StoreError if the store is
         unavailable; the corrections before the one that failed stay applied.
         """
-        store = self.outbox.store
         is_done = self.newest.keeps_references or self.answering is None
         for correction in corrections:
             if self.answering is not None:
-                is_done &= apply_correction(self.answering, store, correction)
+                is_done &= apply_correction(self.answering, self.outbox.store, correction)
             self.corrected_to = correction.number
         return is_done
 

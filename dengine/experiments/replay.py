@@ -371,7 +371,6 @@ class Replay:
             For `check_seconds` that is not finite or not above 0.
         """
         nan = float("nan")
-        policy = self.recipe.policy
         counts = self.stretch()
         accepted = counts["accepted"]
         rejected = counts["rejected"]
@@ -385,12 +384,10 @@ class Replay:
         def quantile(values: Floats, q: float) -> float:
             return float(np.quantile(values, q)) if len(values) else nan
 
-        first_certain = nan
-        if certain:
-            first_certain = float(np.argmax(self.accepted | self.rejected) + 1)
+        first_certain = float(np.argmax(self.accepted | self.rejected) + 1) if certain else nan
         return {
             "recipe": self.name,
-            **{name: getattr(policy, name) for name in POLICY_COLUMNS},
+            **{name: getattr(self.recipe.policy, name) for name in POLICY_COLUMNS},
             "confirm": self.confirm,
             "seed": self.seed,
             "cycles": len(self),
@@ -582,9 +579,7 @@ def replay(
         )
     n_cycles = len(data) if cycles is None else cycles
     expect(1 <= n_cycles <= len(data), f"1 to {len(data)} cycles from {data.name}", n_cycles)
-    order = np.arange(len(data))
-    if shuffle:
-        order = np.random.default_rng(seed).permutation(len(data))
+    order = np.random.default_rng(seed).permutation(len(data)) if shuffle else np.arange(len(data))
     order = order[:n_cycles]
     engine: DataEngine = recipe if contender is None else contender.engine(seed, data.spec)
 

@@ -86,7 +86,7 @@ class CellJournal:
     pending: JournalLine | None
     sum: str
     cut: int
-    set_aside: str = ""
+    set_aside: str
 
 
 def read_journal(path: FilePath, spec: TraceSpec) -> CellJournal:

@@ -74,10 +74,10 @@ class Circumstances:
 
     recipe: Recipe
     spec: TraceSpec
-    model: str | None = None
-    thresholds: Thresholds | None = None
-    novelty: Novelty | None = None
-    safe_mode: str = ""
+    model: str | None
+    thresholds: Thresholds | None
+    novelty: Novelty | None
+    safe_mode: str
 
     @property
     def baseline(self) -> str:

@@ -543,12 +543,11 @@ class ModelPrediction(EngineModel):
         """
         if not isinstance(previous, ModelPrediction):
             return
-        conditions = previous._conditions or self._conditions
         if self.rule is not previous.rule:
             self.rule = previous.rule
             self._decider = None
         self.rule_is_stale = self.rule_is_stale or previous.rule_is_stale
-        self.decider(conditions)
+        self.decider(previous._conditions or self._conditions)
 
     def build_decider(self, conditions: DecisionConditions | None) -> Decider:
         """Build a decider, the module that decides on a trace, for this model.
@@ -840,8 +839,10 @@ class ModelPrediction(EngineModel):
         counts itself. Raises TraceError for another shape, and what `predict_one` raises.
         """
         predictions = self.predict_many(X)
-        n_success = np.array([prediction.n_success for prediction in predictions], np.int64)
-        return n_success, np.array([prediction.n_failure for prediction in predictions], np.int64)
+        return (
+            np.array([prediction.n_success for prediction in predictions], np.int64),
+            np.array([prediction.n_failure for prediction in predictions], np.int64),
+        )
 
     def predict_interval(self, X: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return (lower, upper), each float64 (n,): the bounds of each trace's success probability.
@@ -850,8 +851,10 @@ class ModelPrediction(EngineModel):
         trace. Raises TraceError for another shape, and what `predict_one` raises.
         """
         predictions = self.predict_many(X)
-        lower = np.array([prediction.lower for prediction in predictions])
-        return lower, np.array([prediction.upper for prediction in predictions])
+        return (
+            np.array([prediction.lower for prediction in predictions]),
+            np.array([prediction.upper for prediction in predictions]),
+        )
 
     def decide(self, X: ArrayLike) -> NDArray[Any]:
         """Return an array of `Action`, shape (n,): what the model would do with each trace.

@@ -552,8 +552,11 @@ def _read_explanation(store: SqlStore, id_: str) -> Json:
     if bads.shape[1:] != trace.shape:
         bads = np.zeros((0, *trace.shape))
     band = {name: getattr(explanation.envelope, name, None) for name in ("low", "median", "high")}
-    label_seq = explanation.decision.label_seq  # an id may be another cell's, too
-    corrections = [item for item in store.corrections.after() if item.seq == label_seq]
+    corrections = [
+        item
+        for item in store.corrections.after()
+        if item.seq == explanation.decision.label_seq  # an id may be another cell's, too
+    ]
     return response_fields(
         "Explanation", explanation, trace=trace, bads=bads, corrections=corrections, **band
     )

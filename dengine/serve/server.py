@@ -199,11 +199,11 @@ def serve(
         with closing(service):
             app = create_app(service, tokens, recorder=opened_recorder)
             scheme = "http" if cert is None else "https"
-            options = UVICORN_OPTIONS | {"ssl_certfile": cert, "ssl_keyfile": key}
             address = f"{scheme}://{host_in_url(host)}:{listening.getsockname()[1]}"
             audience = "" if tokens else ", to this machine alone"
             line = f"{service.engine.store.cell_id} is served at {address}{audience}."
-            server = CellServer(uvicorn.Config(app, **options), service, lambda: say(line))
+            config = uvicorn.Config(app, ssl_certfile=cert, ssl_keyfile=key, **UVICORN_OPTIONS)
+            server = CellServer(config, service, lambda: say(line))
 
             async def run() -> None:
                 """Start what runs beside the server, serve until a signal comes, and end it."""

@@ -112,7 +112,7 @@ class CellHistory:
     entries: int
     rows: int
     digest: str
-    waiting: int | None = None
+    waiting: int | None
 
 
 @dataclass(frozen=True, slots=True)
