@@ -316,7 +316,7 @@ class Learner:
     @property
     def is_at_work(self) -> bool:
         """Whether a training is under way in the executor, or its version is not in force yet."""
-        return self._retrainer.future is not None or self._candidate is not None
+        return self._retrainer.future is not None or self.is_swapping
 
     @property
     def is_busy(self) -> bool:

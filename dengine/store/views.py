@@ -13,15 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import expect
-from ..records import Action, Reason, Source
+from ..records import ACTIONS, REASONS, Action, Reason, Source
 from .records import LABEL_WORDS, Outcomes
 
 LABELS = {word: success for success, word in LABEL_WORDS.items()}
 OPTIONS: dict[str, Collection[str]] = {
-    "action": list(Action),
-    "predicted": list(Action),
-    "reason": list(Reason),
-    "label": list(LABELS),
+    "action": ACTIONS,
+    "predicted": ACTIONS,
+    "reason": REASONS,
+    "label": LABELS,
 }
 
 
