@@ -331,9 +331,7 @@ class Recipe:
         value out of range, and if the class of this reducer must be imported for that, and cannot
         be; TypeError for an unknown setting.
         """
-        return replace(
-            self, **{name: value for name, value in settings.items() if value is not None}
-        )
+        return replace(self, **without_none(settings))
 
     def with_policy(self, **changes: Any) -> Recipe:
         """Return a copy whose policy has these settings changed, as `Policy.changed` does.
@@ -420,7 +418,12 @@ def _name_and_params(reducer: Any, params: Params) -> tuple[str, Params]:
     if not is_plain or "<locals>" in cls.__qualname__ or cls.__module__ == "__main__":
         return f"{OBJECT_PREFIX}{cls.__name__}", {}
     name = f"{cls.__module__}:{cls.__qualname__}"
-    return name, {key: value for key, value in values.items() if value is not None}
+    return name, without_none(values)
+
+
+def without_none(values: Table) -> dict[str, Any]:
+    """Return the items of a mapping whose value is not None, as a new dict."""
+    return {name: value for name, value in values.items() if value is not None}
 
 
 def describe_estimator(estimator: Any) -> str:

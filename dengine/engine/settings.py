@@ -16,7 +16,7 @@ from ..decision.policy import NO_LIMITS, Policy
 from ..errors import ImportRefusedError, SettingError, StoreError, expect, listed, log, shortened
 from ..model.base import BaselineAdapter, EngineModel, Model
 from ..model.neighbours import ModelPrediction
-from ..recipe import OBJECT_PREFIX, Recipe, describe_estimator
+from ..recipe import OBJECT_PREFIX, Recipe, describe_estimator, without_none
 from ..records import StoredSettings, TraceSpec, is_whole, stored_trace_spec
 from ..reducers import make_reducer, reducer_class
 from ..store.outbox import Outbox
@@ -120,8 +120,7 @@ class EngineSettings:
         the recipe, and cannot be, or if that default is out of range.
         """
         texts = {"recipe": self.recipe.to_toml(), "seed": str(self.seed), "dengine": __version__}
-        objects = {"model": self.model, "described": self.described}
-        texts |= {name: text for name, text in objects.items() if text is not None}
+        texts |= without_none({"model": self.model, "described": self.described})
         if self.trace is not None:
             texts["trace"] = json.dumps(asdict(self.trace))
         numbers = {
@@ -247,7 +246,7 @@ class EngineSettings:
         out are not compared. A recipe that cannot be read, or that names another reducer than the
         request's, is a SettingError, too.
         """
-        given = {name: value for name, value in request.items() if value is not None}
+        given = without_none(request)
         reducer = given.pop("reducer", None)
         recipe = given.pop("recipe", None)
         policy = given.pop("policy", None)

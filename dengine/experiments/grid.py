@@ -27,6 +27,7 @@ import numpy as np
 from ..datasets import Dataset, load_dataset
 from ..errors import DataError, SettingError, expect
 from ..files import FilePath, read_archive, read_errors, write_output
+from ..recipe import without_none
 from ..records import RetrainReport
 from ..reducers import reducer_class
 from .baselines import baseline_class
@@ -453,9 +454,7 @@ def grid_tasks(
     names = ("interval", "alpha", "lower_bound")
     tasks = []
     for contender, *settings in product(load_contenders(recipes), intervals, alphas, lower_bounds):
-        changes = {
-            name: value for name, value in zip(names, settings, strict=True) if value is not None
-        }
+        changes = without_none(dict(zip(names, settings, strict=True)))
         changed = contender.with_policy(**changes)
         tasks += [Task(changed, seed, cycles, shuffle) for seed in seeds]
     return tasks

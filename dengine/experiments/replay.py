@@ -27,7 +27,7 @@ from ..decision.policy import Policy
 from ..engine.engine import DataEngine
 from ..errors import SettingError, expect
 from ..history.sentences import BOUNDED
-from ..recipe import RECIPES, Recipe
+from ..recipe import RECIPES, Recipe, without_none
 from ..records import (
     ACTIONS,
     Action,
@@ -567,8 +567,7 @@ def replay(
         For an engine of yours, traces that it does not take.
     """
     data = load_dataset(dataset)
-    changes = {"alpha": alpha, "lower_bound": lower_bound}
-    changes = {name: value for name, value in changes.items() if value is not None}
+    changes = without_none({"alpha": alpha, "lower_bound": lower_bound})
     contender = None
     if not isinstance(recipe, DataEngine):
         contender = Contender.load(recipe).with_policy(**changes)
