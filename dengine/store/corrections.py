@@ -138,7 +138,7 @@ class CorrectionTable(CellTable):
         query = (
             sa.select(*CORRECTION.c, *LABEL.c["seq", "content_hash"])
             .select_from(CORRECTION.join(LABEL, CORRECTION_OF_LABEL))
-            .where(self._scope.shared(CORRECTION.c.cell_id), CORRECTION.c.number > after)
+            .where(self._scope.shared(CORRECTION.c.cell_id), CORRECTION.c.number > int(after))
         )
         return [
             from_row(Correction, row._mapping)

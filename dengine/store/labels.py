@@ -121,7 +121,7 @@ class LabelTable(CellTable):
                 scope.shared(LABEL.c.cell_id),
                 TRAINS,
                 label != FORGOTTEN,
-                LABEL.c.seq >= first,
+                LABEL.c.seq >= int(first),
             )
             .order_by(LABEL.c.seq.desc())
             .limit(limit)
@@ -208,7 +208,7 @@ class LabelTable(CellTable):
         query = (
             sa.select(*LABEL.c, *DECISION.c["lower", "upper", "reason"], *audit_columns())
             .select_from(LABEL.join(DECISION, LABEL_OF_DECISION))
-            .where(self._own(LABEL), LABEL.c.seq > after)
+            .where(self._own(LABEL), LABEL.c.seq > int(after))
             .order_by(LABEL.c.seq)
         )
         rows = self._read(query if upto is None else query.where(LABEL.c.seq <= upto))
@@ -276,7 +276,7 @@ class LabelTable(CellTable):
             .where(
                 self._own(LABEL),
                 TRAINS,
-                LABEL.c.seq > seq,
+                LABEL.c.seq > int(seq),
                 LABEL.c.source != Source.INSPECTION.value,
                 label != FORGOTTEN,
                 DECISION.c.model_version >= since_version,

@@ -102,7 +102,7 @@ class VersionTable(CellTable):
         blob = None if arrays is None else to_npz(arrays)
         return {
             "time": now,
-            "last_seq": last_seq,
+            "last_seq": int(last_seq),
             "state": blob,
             "state_sum": state_sum(blob),
         } | to_row(report)
