@@ -641,7 +641,7 @@ def parse_stated(items: Iterable[str]) -> Values:
     A value is read as TOML; if it is not valid TOML, it is the text itself. Only the first `=` of
     an item divides it, and white space around the key is removed. If a key comes twice, its last
     value counts. Whether there is such a key is not checked. Raises click.UsageError for an item
-    without `=`, and for a list or table that is not valid TOML.
+    without `=`, and for a text in brackets or braces that is not valid TOML.
     """
     stated = Values()
     for item in items:
@@ -652,12 +652,13 @@ def parse_stated(items: Iterable[str]) -> Values:
         try:
             value = tomllib.loads(f"value = {text}")["value"]
         except tomllib.TOMLDecodeError:
-            if text.startswith(("[", "{")):
+            if text[:1] + text[-1:] in ("[]", "{}"):
                 raise click.UsageError(
                     f"Expected TOML in --set {item}: texts in double quotes, and all of it in "
                     'single ones, as in --set \'label.bad=["crack", "burr"]\'.'
                 ) from None
-        stated[name.strip()] = value
+        # True and false may be words of labels; a key of type boolean takes the text, too.
+        stated[name.strip()] = text if isinstance(value, bool) else value
     return stated
 
 

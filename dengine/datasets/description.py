@@ -16,10 +16,10 @@ import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field, fields, replace
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any, Literal, get_args, get_origin
 
-from ..errors import DataError, instead
+from ..errors import DataError, instead, listed
 from ..files import FilePath, toml_value, write_output
 from .dataset import expect_data
 
@@ -431,8 +431,9 @@ class Description:
 
     @property
     def listings(self) -> set[str]:
-        """The files that list labels or windows, as paths from the folder; perhaps also ""."""
-        return {self.windows.listing, *(source.listing for source in self.labels)}
+        """The files that list labels or windows, as paths from the folder; also "." for none."""
+        names = (self.windows.listing, *(source.listing for source in self.labels))
+        return {PurePath(name).as_posix() for name in names}  # also ./labels.csv
 
     @property
     def is_cut(self) -> bool:
@@ -547,7 +548,7 @@ def _made(kind: Any, value: Any, where: str) -> Any:
     if kind is Channel and not isinstance(value, Mapping):
         value = {"unit": value}
     example = "NAME" if origin is Mapping else fields(kind)[0].name
-    name = where.rpartition(" ")[2]
+    name = where.rpartition(", ")[2]
     do = f"state keys in it, like {name}.{example}"
     expect_data(isinstance(value, Mapping), f"{where} to be a table", value, do)
     if origin is Mapping:
@@ -575,15 +576,17 @@ def _as_kind(kind: Any, value: Any, where: str) -> Any:
 
     The text `?` stands for a value that the user must still state. `kind` is a type in `KINDS`:
     text, whole number, number, boolean, or whole number or text. A number or boolean becomes a
-    text, as TOML writes it (`true`, `nan`), if only a text is expected, and a whole number
-    becomes a float if a number is expected. Raises DataError for a value of another type; and, if a
-    number is expected, for one that is not finite or too large for a float. `where` is the name of
-    the key in the message.
+    text, as Python writes it (`True`, `nan`), if only a text is expected, the text `true` or
+    `false` a boolean, and a whole number becomes a float if a number is expected. Raises DataError
+    for a value of another type; and, if a number is expected, for one that is not finite or too
+    large for a float. `where` is the name of the key in the message.
     """
     if value == UNKNOWN:
         return value
     if kind is str and isinstance(value, int | float):
-        return toml_value(value)
+        return str(value)
+    if kind is bool and value in ("true", "false"):
+        return value == "true"
     wanted = float | int if kind is float else kind
     is_kind = isinstance(value, bool) == (kind is bool) and isinstance(value, wanted)
     is_finite = kind is not float or (is_kind and abs(value) <= sys.float_info.max)
@@ -597,7 +600,7 @@ def expect_one_of(names: Iterable[str], name: str, where: str) -> None:
     The message has the most similar of `names`, or lists all if none is similar, and says `where`.
     """
     nearest = difflib.get_close_matches(str(name), names, 1)
-    wanted = repr(nearest[0]) if nearest else f"one of {', '.join(names)}"
+    wanted = repr(nearest[0]) if nearest else f"one of {listed(names)}"
     expect_data(name in names, f"{wanted} in {where}", name)
 
 
@@ -636,15 +639,17 @@ def flat(prefix: str, value: Stated) -> Values:
 
 def is_open(value: Any) -> bool:
     """Return whether a value of a description is `?`, or a list with `?` in it."""
-    return UNKNOWN in (value if isinstance(value, list) else [value])
+    return UNKNOWN in (value if isinstance(value, list | tuple) else [value])
 
 
 def as_option(key: str, value: Any) -> str:
     """Return how a key is stated on the command line, as a shell takes it: `--set order=name`.
 
-    A text is written as it is, and any other value as TOML.
+    A text is written as it is if it begins with a letter or `(` and has no quotes; any other value
+    is written as TOML.
     """
-    text = value if isinstance(value, str) else toml_value(value)
+    is_plain = isinstance(value, str) and re.fullmatch(r"[^\W\d][^\"'\n]*|\(.*", value)
+    text = value if is_plain else toml_value(value)
     return f"--set {shlex.quote(f'{key}={text}')}"
 
 

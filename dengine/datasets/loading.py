@@ -133,8 +133,9 @@ def description_of(
         Values of keys like `label.column`. They replace those in a description file, and a proposal
         keeps them. Not used if `description` is a Description or a mapping.
     propose : bool
-        Whether a description is proposed if none was saved, or one with `?` in it, whose other
-        values the proposal keeps; if not, DataError is raised.
+        Whether a description is proposed if none was saved, or one with `?` in it; the
+        proposal keeps its other values that are no defaults. If not, DataError is raised, unless
+        `stated` answers each `?`.
 
     Raises
     ------
@@ -170,8 +171,9 @@ def description_of(
             return about
     # What an answer to a ? leads to, like a rate, is not in the file.
     proposal = describe(source, {**about.to_dict(), **given})
-    if propose:
+    if propose or not (about.open_keys or proposal.open_keys):
         return proposal
+    expect_data(isinstance(source, str | Path), "a description without ?", [*proposal.open_keys])
     raise DataError(missing_text(source, path, proposal))
 
 
@@ -183,6 +185,8 @@ def missing_text(source: Path, path: Path, proposal: Description) -> str:
     the commands that show and save the proposal.
     """
     command = f"dengine data {shlex.quote(str(source))}"
+    if path != saved_description(source):
+        command += f" --description {shlex.quote(str(path))}"
     found, force = ("one with ?", " --force") if path.is_file() else ("none", "")
     keys = proposal.open_keys
     state = " --set KEY=VALUE" if keys else ""

@@ -25,7 +25,7 @@ from ..table import Table
 from .bags import propose_bag
 from .columns import Proposal, Tables, most_frequent
 from .labels import WORD
-from .layout import layout_of, parts_of
+from .layout import MOST_PARTS, layout_of, parts_of
 from .roles import propose_roles
 from .text_form import MOST_BYTES, propose_form
 
@@ -84,10 +84,10 @@ def describe(source: Any, stated: Stated | None = None) -> Description:
     DataError
         If there is no file, or none that can be read and holds samples, or if the package that
         reads such files is not installed. Also if a stated value is wrong: an unknown key or a
-        value of the wrong type, a column of times, a channel or, in the layout `long`, a
-        `part.column` that does not exist (those of a ROS bag are not checked), a place of the
-        labels at which no recording has one, a malformed pattern of files, or settings in `[text]`
-        or `[time]` that no file can be read with.
+        value of the wrong type, a column of times or of `[rows]`, a channel or, in the layout
+        `long`, a `part.column` that does not exist (those of a ROS bag are not checked), a place of
+        the labels at which no recording has one, a malformed pattern of files, or settings in
+        `[text]` or `[time]` that no file can be read with.
     SettingError
         If a stated `windows.trigger`, which cuts long recordings, is malformed.
     ValueError
@@ -312,7 +312,7 @@ def propose_tables(p: Proposal, files: Tables) -> None:
         p.notes["channels"] = "they follow from layout and part.column"
         return
     parts = parts_of(p, files)
-    p.tables = [part for part in parts if not part.damage]
+    p.tables = [part for part in parts if not part.damage][:MOST_PARTS]
     if not p.tables:
         why = "".join(f" {error}." for part in parts[:1] for error in part.damage[:1])
         raise DataError(f"Expected recordings in {listed(p.names)}, found none.{why}")

@@ -75,7 +75,8 @@ def propose_clock(p: Proposal) -> None:
         forms = [form_of(column, p) for column in clocks]
         p.put("time.format", forms)
         if UNKNOWN in forms and len(forms) > 1:
-            p.notes["time.format"] += f"; state all, like {as_option('time.format', forms)}"
+            option = as_option("time.format", forms)
+            p.notes["time.format"] += f"; state all, with a form for ?: {option}"
     elif names:
         p.put(
             "time.column",
@@ -266,7 +267,7 @@ def propose_rate(p: Proposal, tables: Tables) -> None:
     means = [s[s >= 0].mean() for s in steps if (s >= 0).any()]
     usual = float(np.median(means or 0.0))
     if not is_rate(usual):
-        why = [*unread, f"steps of {usual:.6g} s are of no force"][0]
+        why = [*unread * (not means), f"steps of {usual:.6g} s are of no force"][0]
         p.put(
             "time.rate_hz",
             UNKNOWN,

@@ -47,7 +47,9 @@ NUMBER = re.compile(
 )
 # Names of channels, the likeliest first.
 FORCES = (
-    re.compile(r"(?i)(^|[^a-z])f_?z(?![a-z])|(force|kraft|wrench)[^a-z]*z(?![a-z])|tcp_force_2$"),
+    re.compile(
+        r"(?i)(^|[^a-z])f_?z(?![a-z])|(force|kraft|wrench)[^a-z]*z(?-i:(?![a-z]))|tcp_force_2$"
+    ),
     re.compile(
         r"(?i)force|kraft|fuerza|forza|load|torque|drehmoment|thrust|effort|last\b|力|荷重"
         r"|^(.*\.)?_?(f\b.*|value)$"

@@ -197,7 +197,7 @@ def part_words(source: PartSource, tables: Tables) -> Words:
 
     `source` says where the number stands; if it states nothing, each number is "". `tables` has the
     table of each recording. Recordings whose number is missing, empty or not the same in all rows
-    are left out, and all of them if the path in `source` is no regular expression with one group.
+    are left out. Raises DataError if the path in `source` is no regular expression with one group.
     """
     words = dict[str, str]()
     for table in tables:

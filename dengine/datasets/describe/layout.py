@@ -145,7 +145,7 @@ def numbered_columns(table: Table) -> list[str]:
 
 
 def parts_of(p: Proposal, files: Tables) -> list[Table]:
-    """Return the tables of the first 240 parts without damage, by the layout in `p.description`.
+    """Return the tables of the parts, also of damaged ones, by the layout in `p.description`.
 
     `p` has the description so far, which is not changed, and the layout says how files hold parts.
     `files` has the table of each file that is looked at, at least one. In the layout `long` a file
@@ -171,4 +171,4 @@ def parts_of(p: Proposal, files: Tables) -> list[Table]:
         of_file = [*split(table, description)]
         is_cut = p.is_cut and layout == "long" and len(of_file) > 1
         parts += of_file[: len(of_file) - is_cut]
-    return parts[:MOST_PARTS]
+    return parts

@@ -9,6 +9,8 @@ from operator import itemgetter
 from pathlib import PurePath
 from typing import Any
 
+import numpy as np
+
 from ...errors import DataError, listed
 from ..description import UNKNOWN, LabelSource, Strings
 from ..read.files import HALF_DAY, file_key, is_unsorted, natural_key, sort_key
@@ -24,7 +26,7 @@ STAMP = re.compile(
     r"|20[0-4]\d[01]\d[0-3]\d[T_ -]?\d{4}(\d\d)?)$"
 )
 YEAR = re.compile(r"20[0-4]\d([01]\d[0-3]\d((\d\d){1,3})?)?")  # with month, day and time of day
-MARK = re.compile(r"[-_. :T/]?")  # between the numbers of a date
+MARK = re.compile(r"[-_. :/]?T?")  # between the numbers of a date
 # Numbers of a date with the day or the month first, like 010324 and the time of day.
 DAY_FIRST = re.compile(
     r"[0-3]?\d[0-3]\d(20)?[0-4]\d[0-2]\d[0-5]\d([0-5]\d)?|[0-3]?\d[0-3]\d20[0-4]\d"
@@ -39,8 +41,8 @@ def propose_order(p: Proposal) -> None:
     `p` is the description so far. The files are sorted by path without the words in it that are
     labels; in the layout `columns` the columns' names count in place of files, as they stand. If
     this proves the order (`proves_order`), it is `name` if file names give the same order, else
-    `path`; if not, it is `name` if the names without folders prove it, else `?`, with a note. While
-    `label.column` is `?`, paths are not looked at.
+    `path`; if not, it is `name` if the names without folders are distinct and prove it, else `?`,
+    with a note. While `label.column` is `?`, paths are not looked at.
 
     In this order, or by name if it is not proved, parts are then compared. `order` is also `?` if
     part numbers, dates, times or counters of the recordings have another order (`unsorted_places`);
@@ -61,7 +63,7 @@ def propose_order(p: Proposal) -> None:
     if is_known and proves_order([stems[path] for path in by_path]):
         files = by_path
         p.put("order", "name" if by_path == by_name else "path")
-    elif is_known and not (len({*names}) > 1 and proves_order(names)):
+    elif is_known and not (len({*names}) == len(names) > 1 and proves_order(names)):
         p.put(
             "order",
             UNKNOWN,
@@ -104,10 +106,11 @@ def proves_order(names: Strings) -> bool:
 def may_count(numbers: Sequence[int]) -> bool:
     """Return whether numbers in names may count: their range is below ten times how many they are.
 
-    Random numbers, serial numbers with gaps and times of day are seldom so; seconds since 1970 and
-    the like (`STAMP`) may.
+    Or they rise in equal steps. Random numbers, serial numbers with gaps and times of day seldom
+    do; seconds since 1970 and the like (`STAMP`) may.
     """
-    return max(numbers) - min(numbers) < MOST_GAPS * len(numbers) or fits_all(STAMP, numbers)
+    is_dense = max(numbers) - min(numbers) < MOST_GAPS * len(numbers)
+    return is_dense or len({*np.diff(numbers)}) == 1 or fits_all(STAMP, numbers)
 
 
 def find_date(pieces: Sequence[Any]) -> range:

@@ -68,11 +68,11 @@ def propose_roles(p: Proposal) -> None:
     and if its column is `?`, `order` stays as it is. `ignored` becomes the columns without any use,
     with their units. `exclude` becomes the files in `p.others` without listings of labels, if there
     are any, unless `exclude` is `?`. Stated keys stay, but a stated `ignored` is replaced, and a
-    stated `[rows]` gets further words and columns (`complete_rows`, `qualify_rows`).
-    `p.columns` is set, and `p.tables` loses rows that are no samples. Raises DataError if a stated
-    column of times or channel does not exist, a setting in `[time]` is wrong, a stated source of
-    labels has no words (like `ok`) or cannot be read, or cells are lists, and SettingError for a
-    malformed `windows.trigger`.
+    stated `[rows]` gets further words and columns (`complete_rows`, `qualify_rows`). `p.columns` is
+    set, and `p.tables` loses rows that are no samples. Raises DataError if a stated column of
+    times, of `[rows]` or channel does not exist, no word of a stated `keep` comes, a setting in
+    `[time]` is wrong, a stated source of labels has no words (like `ok`) or cannot be read, or
+    cells are lists, and SettingError for a malformed `windows.trigger`.
     """
     p.columns = columns_of(p.tables, p.description.text)
     for name in (*p.description.time.column, *p.description.channels, *p.description.rows):
@@ -107,15 +107,13 @@ def complete_rows(p: Proposal) -> None:
     out of `p.tables` and `p.columns`; a recording keeps all rows if it lacks a column of `[rows]`.
     But a recording with one cell in such a column is left out as a whole if the word of this cell
     drops it; if that leaves out all recordings, all of them stay. Raises DataError if none of the
-    stated words of a column comes in it.
+    words that `keep` states comes in its column.
     """
     rows = dict(p.description.rows)
-    for name in rows.keys() & p.columns.keys():
-        about = rows[name]
+    for name, about in p.description.rows.items():
         words = sorted(p.columns[name].counts)
-        stated = about.keep + about.drop + about.invalid
-        if stated and {*stated}.isdisjoint([*words, ANY]):
-            expect_one_of(words, stated[0], f"rows.{name}")
+        if about.keep and {*about.keep}.isdisjoint([*words, ANY]):
+            expect_one_of(words, about.keep[0], f"rows.{name}")
         others = tuple(word for word in words if about.kinds([word]) == [""])
         if len(others) > MOST_WORDS:
             others = (ANY,)
@@ -175,8 +173,8 @@ def may_qualify(column: Column, n_rows: int) -> bool:
     recording that has the column. It must be a status (`is_status`), or have 1 to 12 different
     texts, perhaps beside numbers, like `Max` in a footer, and no times, and it must change within a
     recording. If it does not, there must be several words, of which one names a force or a torque,
-    or it must be named like a status (`Status`, `valid`), a unit or a factor and have just one word
-    in all: recordings with another one become faults.
+    or it must be named like a status (`Status`, `valid`), a unit, a factor or a rate and have just
+    one word in all: recordings with another one become faults.
     """
     words = column.counts
     is_text = 0 < len(texts_of(column)) <= MOST_WORDS
@@ -248,10 +246,11 @@ def propose_channels(p: Proposal, units: Mapping[str, str]) -> None:
     """Set `[channels]` in `p` to one column, with its unit; does nothing if channels are stated.
 
     It is the only likely one (`likely_channels`). The channels stay empty, with a note, if there is
-    none or several, if the column is named like a set value or a limit or stands for columns that
-    are not numbered evenly, like `x0`, `x1`, `x5` (`_doubt_on`), or if a unit, a factor of scale or
-    a sampling rate that the recordings state differs between them (`_other_scales`). Raises
-    SettingError for a malformed `windows.trigger` (the condition at which a part begins).
+    none or several, if the column is named like a set value, a limit or an error or stands for
+    columns that are not numbered evenly, like `x0`, `x1`, `x5` (`_doubt_on`), or if a unit, a
+    factor of scale or a sampling rate that the recordings state differs between them
+    (`_other_scales`). Raises SettingError for a malformed `windows.trigger` (the condition at which
+    a part begins).
 
     units : the columns that may be channels, with their units, "" for unknown.
     """

@@ -20,11 +20,11 @@ import numpy as np
 from ...errors import DataError, listed
 from ..dataset import Faults
 from ..description import UNKNOWN, Stated, Strings, TextForm, as_option
-from ..read.files import caught
+from ..read.files import caught, natural_key
 from ..read.text import BLANK, COMMENT, LATIN, header_names, split_line, to_utf8, to_utf8_or_latin
 from ..table import pattern_of
 from ..units import is_unit
-from .clock import EVEN
+from .clock import CLOCK_NAME, EVEN
 from .columns import MOST_WORDS, NUMBER, Proposal, most_frequent
 
 DELIMITERS = ";\t|, "
@@ -182,12 +182,12 @@ def _head_lines(rows: Rows, width: int, stated: Stated) -> tuple[int, int]:
     A candidate for either is a line of at least `width` cells, the number of columns, of which one
     is neither empty nor a row of dashes. The header is the last candidate; but if more than half of
     its cells are units, and there is an earlier candidate, it is the line of the units, and the one
-    before it the header. So it is if the last has no more than comments on names and units directly
-    above each other: the candidate before it has nothing but units, and the line before that is a
-    candidate, too. Otherwise DataError is raised if several candidates may be the header: if the
-    one before the last has nothing but units; or if the last has a unit, or a name twice, and the
-    one before no empty cell. But not if `stated`, the keys that the user gave, has `text.header`
-    (its value is not used here).
+    before it the header. Otherwise it is doubtful if the candidate before the last has nothing but
+    units; or if the last has a unit, or a name twice, and the one before no empty cell. Then the
+    last has comments if that candidate has nothing but units, and the line right above it is a
+    candidate that names a clock: these two are units and header. If not, DataError is raised. If
+    `stated`, the keys that the user gave, has `text.header`, there is no doubt (its value is not
+    used here).
 
     rows : the cells of the lines above the samples.
     """
@@ -201,12 +201,17 @@ def _head_lines(rows: Rows, width: int, stated: Stated) -> tuple[int, int]:
         above, last = (rows[i - 1] for i in heads[-2:])
         if _share_of_units(last) > HALF:
             header, units = heads[-2:]
-        elif _share_of_units(above) == 1 and heads[-3:-2] == [heads[-2] - 1]:
-            header, units = heads[-3:-1]
         elif "text.header" not in stated and _is_doubtful(above, last):
-            raise DataError(
-                f"Expected one line of names, lines {listed(heads)} may be; state text.header."
+            has_comments = (
+                _share_of_units(above) == 1
+                and heads[-3:-2] == [heads[-2] - 1]
+                and any(map(CLOCK_NAME.search, rows[heads[-2] - 2]))
             )
+            if not has_comments:
+                raise DataError(
+                    f"Expected one line of names, lines {listed(heads)} may be; state text.header."
+                )
+            header, units = heads[-3:-1]
     return header, units
 
 
@@ -251,14 +256,19 @@ def propose_form(p: Proposal, contents: Mapping[str, bytes], faults: Faults) -> 
     )
     same = [name for name, form in forms.items() if form == usual]
     odd = forms.keys() - same
-    p.set_aside(sorted(odd))
+    p.set_aside(sorted(odd, key=natural_key))
     odd -= p.description.listings
     without_numbers = partial(DIGITS.sub, "0")
     if len({*map(forms.get, odd)}) < len(odd) or (
         {*map(without_numbers, odd)} & {*map(without_numbers, same)}
     ):
-        option = as_option("exclude", sorted(odd))
-        p.put("exclude", UNKNOWN, f"recordings of another form? If not: {option}; if so, see files")
+        names = sorted(odd, key=natural_key)
+        p.put(
+            "exclude",
+            UNKNOWN,
+            f"are {listed(names)} recordings of another form? If not, state a pattern, like "
+            f"{as_option('exclude', names[:2])}; if so, see files",
+        )
     _propose_keys(p, [looks[name] for name in same])
     return same
 

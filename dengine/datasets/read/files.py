@@ -20,7 +20,7 @@ DECIMAL = re.compile(r"[0-9]+(\.[0-9]*)?([eE]\+?[0-9]+)?")
 HALF_DAY = re.compile(r"\d ?[aApP][mM](?![A-Za-z])")
 # Dates and times that are in another order than the numbers in them.
 UNSORTED = re.compile(
-    rf"(?<!\d)(?<!\d[-./ ])\d\d?([-./ ])(\d\d?|[A-Za-z]{{3,9}})\1\d{{2,4}}(?!\d)|{HALF_DAY.pattern}"
+    rf"(?<!\d)(?<!\d[-./])\d\d?([-./ ])(\d\d?|[A-Za-z]{{3,9}})\1\d{{2,4}}(?!\d)|{HALF_DAY.pattern}"
 )
 BAD = (ValueError, NotImplementedError, OSError, IndexError)  # what an unusable pattern raises
 
@@ -103,8 +103,7 @@ def find_files(root: Path, description: Description) -> list[str]:
     """
     if root.is_file():
         return [root.name]
-    listings = {Path(name).as_posix() for name in description.listings}  # also ./labels.csv
-    aside = {FOLDER_FILE, *listings}
+    aside = {FOLDER_FILE, *description.listings}
     names = match_files(root, description.files) - match_files(root, description.exclude) - aside
     if not names:
         raise DataError(
