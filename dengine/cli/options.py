@@ -492,18 +492,18 @@ class DataChoice:
         Parameters
         ----------
         propose : bool
-            If no description is given or saved: True proposes one, in which `?` marks what is open;
-            False raises DataError, whose message says what to type.
+            If no description is given or saved, or one with `?` in it that is not stated: True
+            proposes one, in which `?` marks what is open; False raises DataError, whose message
+            says what to type.
 
         Raises
         ------
         DataError
             If the description cannot be read or proposed, or a stated key is unknown or its value
             has the wrong type. If the source does not exist or is damaged, or is a bundled set and
-            a key is stated; but if a description is given, the source is not looked at.
+            a key is stated; but if a description without `?` is given, the source is not looked at.
         SettingError
-            If none is given or saved, and a stated `windows.trigger` (where a part begins) is
-            malformed.
+            If one is proposed, and a stated `windows.trigger` (where a part begins) is malformed.
         """
         from ..datasets.loading import description_of, own_reader
 
