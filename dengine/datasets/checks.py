@@ -97,7 +97,7 @@ def without_repeats(recordings: Sequence[Recording]) -> tuple[list[Recording], F
     groups = defaultdict[int, list[Recording]](list)
     for hash_, recording in zip(hashes, recordings, strict=True):
         groups[hash_].append(recording)
-    kept: list[Recording] = []
+    kept = list[Recording]()
     faults: Faults = []
     for group in groups.values():
         source = group[0].source

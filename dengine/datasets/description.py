@@ -448,7 +448,7 @@ class Description:
         counted. In `[[check]]` it is a word that no recording has, and recordings with other words
         become faults.
         """
-        values = flat("", {**self.to_dict(), "ignored": {}})
+        values = flat({**self.to_dict(), "ignored": {}})
         keys = [key for key, value in values.items() if is_open(value)]
         return tuple(keys if self.channels else [*keys, "channels"])
 
@@ -621,17 +621,17 @@ def _plain(value: Any) -> Any:
     return {k: _plain(v) for k in names if (v := getattr(value, k)) != getattr(default, k)}
 
 
-def flat(prefix: str, value: Stated) -> Values:
+def flat(value: Stated, prefix: str = "") -> Values:
     """Return a nested mapping as one dict: `{"a": {"b": 1}}` becomes `{"a.b": 1}`.
 
     An empty mapping within it is left out. If two keys become equal, the later one counts.
 
-    prefix : text that is put before each key; no dot is added. value : the mapping.
+    value : the mapping. prefix : text that is put before each key; no dot is added.
     """
     items: Values = {}
     for name, item in value.items():
         if isinstance(item, Mapping):
-            items |= flat(f"{prefix}{name}.", item)
+            items |= flat(item, f"{prefix}{name}.")
         else:
             items[f"{prefix}{name}"] = item
     return items

@@ -20,7 +20,6 @@ from .read.files import as_source
 from .read.recordings import read_recordings
 
 BUNDLED = {"insertion": "insertion.npz"}
-OWN_ARRAYS = ("X", "y", "scale", "rate_hz", "unit", "cause", "channels", "part")
 
 
 def load_dataset(
@@ -218,7 +217,7 @@ def own_reader(source: Any) -> Callable[[], Dataset] | None:
     if hasattr(source, "columns"):
         return partial(_from_own_frame, source) if OWN in source.attrs else None
     if name := BUNDLED.get(str(source)):
-        source = Path(str(files("dengine"))) / "data" / name
+        source = files("dengine") / "data" / name
     path = as_source(source)
     if path.is_file() and not saved_description(path).is_file():
         is_own, read = OWN_FILES.get(path.suffix.lower(), (is_database, _read_store))
@@ -284,7 +283,9 @@ def _read_npz(path: Path) -> Dataset:
     is multiplied by `scale`. Raises DataError if `read_archive` refuses the file, an array cannot
     be converted, or `make_dataset` refuses the arrays.
     """
-    arrays, _ = read_archive(path, OWN_ARRAYS)
+    arrays, _ = read_archive(
+        path, ("X", "y", "scale", "rate_hz", "unit", "cause", "channels", "part")
+    )
     with read_errors(path, "an .npz file of plain arrays"):
         X = arrays["X"] * arrays.get("scale", np.ones(1)).astype(np.float32)
         units, channels = (

@@ -38,7 +38,7 @@ def write_sample(folder: FilePath, n: int = 200) -> None:
         If the folder holds something or cannot be written.
     """
     rng = np.random.default_rng(0)
-    data = load_dataset("insertion")
+    data = load_dataset()
     with new_folder(folder) as target:
         for i, row in enumerate(rng.permutation(len(data))[:n], 1):
             rows = rng.integers(960, 1001)

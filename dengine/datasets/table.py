@@ -47,7 +47,7 @@ class Table:
         Numbers, times, or texts as objects. In a file of a single part a column with one cell holds
         for all rows.
     lines : sequence or array of int
-        Line in the file of each row, or one line for all rows.
+        Line in the file of each row, or one line for all rows; empty: not known.
     units : mapping of str to str
         Units that the file states for its columns.
     above : sequence of str
@@ -66,7 +66,7 @@ class Table:
 
     source: str
     columns: Mapping[str, Cells]
-    lines: Sequence[int] | Cells
+    lines: Sequence[int] | Cells = ()
     units: Mapping[str, str] = field(default_factory=dict)
     above: Strings = ()
     header: int = 0
@@ -143,7 +143,7 @@ class Table:
         """
         if is_bad.any():
             row = int(is_bad.argmax())
-            cell = shortened(self.columns[name][row : row + 1].tolist()[0])
+            cell = shortened(self.columns[name].tolist()[row])
             column = self.origin[name][row] if name in self.origin else name
             raise UnreadableError(f"Expected {wanted}, got {cell}", self.line(row), column)
 
@@ -152,7 +152,7 @@ class Table:
         row = row if len(self.lines) > 1 else 0
         return int(self.lines[row]) if row < len(self.lines) else 0
 
-    def one_word(self, name: str, at: str = "same") -> str:
+    def one_word(self, name: str, at: str) -> str:
         """Return the one word, like a label or part number, that a column has for a recording.
 
         The table holds the rows of the recording. The word is "" for an empty cell. Raises

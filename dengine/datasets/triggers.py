@@ -88,10 +88,6 @@ KINDS: dict[str, tuple[str, Trigger, Any]] = {
         lambda values, speed: np.linalg.norm(values, axis=0) > speed,
     ),
 }
-EXAMPLES = (
-    "bit=0, register@output_int_register_25, register=1@/phase, contact=5, contact=5@FZ_Base,"
-    " motion=0.002"
-)
 
 
 def as_trigger(value: Any) -> Trigger:
@@ -113,7 +109,10 @@ def as_trigger(value: Any) -> Trigger:
     match = re.fullmatch(r"(\w+)(?:=([^@]*))?(?:@(.+))?", str(value).strip())
     kind, number, signal = match.groups(default="") if match else ("", "", "")
     if kind not in KINDS or not re.fullmatch(KINDS[kind][0], number):
-        raise SettingError(f"Expected a trigger, as {EXAMPLES}; got {shortened(value)}.")
+        raise SettingError(
+            "Expected a trigger, as bit=0, register@output_int_register_25, register=1@/phase, "
+            f"contact=5, contact=5@FZ_Base, motion=0.002; got {shortened(value)}."
+        )
     default = KINDS[kind][1]
     stated = float(number) if number else default.number
     return replace(default, number=stated, signal=signal or default.signal)

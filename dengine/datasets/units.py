@@ -9,7 +9,8 @@ from importlib.resources import files
 
 TABLE = tomllib.loads((files("dengine") / "data" / "units.toml").read_text("utf-8"))
 OTHERS = TABLE.pop("others")["units"]
-# Each unit with its quantity and the factor to that quantity's first.
+# Each unit with its quantity, like "force", and the factor to that quantity's first, like N. A unit
+# that is converted to no other, like `%` or `Hz`, is not here.
 UNITS: dict[str, tuple[str, float]] = {
     unit: (name, factor) for name, units in TABLE.items() for unit, factor in units.items()
 }
@@ -23,18 +24,9 @@ def bare(unit: str) -> str:
     return unit.strip(MARKS)
 
 
-def quantity_of(unit: str) -> tuple[str, float] | None:
-    """Return the quantity of a unit, like "force", and the factor to its first unit, like N.
-
-    None for an unknown unit, for one that is converted to no other, like `%` or `Hz`, and for a
-    unit in brackets (see `bare`). Capital and small letters differ.
-    """
-    return UNITS.get(unit)
-
-
 def is_load(unit: str) -> bool:
     """Return whether a unit, without brackets, is one of force or torque."""
-    return (quantity_of(unit) or ("",))[0] in ("force", "torque")
+    return UNITS.get(unit, ("",))[0] in ("force", "torque")
 
 
 def is_unit(text: str) -> bool:

@@ -16,6 +16,7 @@ from ...errors import DataError, listed
 from ..checks import check_forms
 from ..dataset import Faults, expect_data
 from ..description import UNKNOWN, Clock, Description, Stated, Strings, flat, is_open
+from ..read.bags import BAG
 from ..read.files import as_source, caught, match_files, natural_key, read_file
 from ..read.frames import read_frame
 from ..read.places import without_suffix
@@ -29,9 +30,16 @@ from .layout import MOST_PARTS, layout_of, parts_of
 from .roles import propose_roles
 from .text_form import MOST_BYTES, propose_form
 
-TEXTS = (".csv", ".tsv", ".txt", ".dat", ".asc", ".lvm", ".log", ".prn")
 # The format of files with each suffix; `.gz` may stand behind it.
-SUFFIXES = dict.fromkeys(TEXTS, "text") | {
+SUFFIXES = {
+    ".csv": "text",
+    ".tsv": "text",
+    ".txt": "text",
+    ".dat": "text",
+    ".asc": "text",
+    ".lvm": "text",
+    ".log": "text",
+    ".prn": "text",
     ".json": "json",
     ".jsonl": "jsonl",
     ".ndjson": "jsonl",
@@ -47,7 +55,6 @@ FOREIGN = (".npy", ".mat", ".h5", ".hdf5", ".tdms", ".bag", ".xlsx", ".xls", ".f
 NO_RECORDING = re.compile(
     r"(?i)(^|/)(\.|(readme|licen[sc]e|notes|changelog)(\.[^/]*)?$|recordings\.toml$)"
 )
-BAG = ".mcap"
 MOST_FILES = 60  # that are read
 MOST_ROWS = 50_000
 MOST_PIECES = 4  # of a part's curve, in files with numbers behind their names
@@ -94,7 +101,7 @@ def describe(source: Any, stated: Stated | None = None) -> Description:
         If the index of a DataFrame is named like one of its columns.
     """
     source = as_source(source)
-    stated = {key: value for key, value in flat("", stated or {}).items() if not is_open(value)}
+    stated = {key: value for key, value in flat(stated or {}).items() if not is_open(value)}
     p = Proposal(stated, Description().with_values(stated))
     check_forms(Clock(), p.description.text)
     if not isinstance(source, Path):
@@ -247,7 +254,7 @@ def read_tables(p: Proposal) -> list[Table]:
     faults: Faults = []
     size = (p.base / p.names[0]).stat().st_size + 1
     n = min(MOST_FILES, max(3, MOST_BYTES // size))
-    for i in sorted({*np.linspace(0, len(p.names) - 1, n).astype(int)}):
+    for i in np.unique(np.linspace(0, len(p.names) - 1, n).astype(int)):
         name = p.names[i]
         with caught(faults, name):
             contents[name] = read_file(p.base / name)

@@ -71,7 +71,7 @@ def propose_bag(p: Proposal) -> None:
     p.put("time.format", "ns")
     topic = [*channels, *units, ""][0].partition(".")[0]
     clock = dict.fromkeys(p.description.time.column, np.array(times[topic]))
-    propose_rate(p, [Table(topic, clock, [])])
+    propose_rate(p, [Table(topic, clock)])
     p.put("traces.samples", UNKNOWN, "how many samples has a part from where it begins?")
     topics = f"one of {'; '.join(f'{t} ({counts_of(cells)})' for t, cells in words.items())}"
     if not p.description.windows.listing:

@@ -15,7 +15,7 @@ from ..description import ANY, UNKNOWN, TextForm, as_option
 from ..read.clock import UNITS, check_steps, has_day, scale_of, times_of
 from ..read.files import caught
 from ..table import Table
-from ..units import quantity_of
+from ..units import UNITS as QUANTITIES
 from .columns import FORCES, Column, Proposal, Tables
 
 CLOCK_NAME = re.compile(
@@ -38,7 +38,7 @@ NAMED_UNIT = re.compile(
 )
 # Counts since some day: their unit, and the seconds from that day to 1970.
 # Spreadsheets count days since 1900, and WinCC a millionth of them.
-EPOCHS = dict.fromkeys(("s", "ms", "us", "ns"), 0) | dict.fromkeys(("d", "0.0864 s"), 2_209_161_600)
+EPOCHS = {"s": 0, "ms": 0, "us": 0, "ns": 0, "d": 2_209_161_600, "0.0864 s": 2_209_161_600}
 GUESSES = ("s", "ms", "us", "ns", "min", "d", "0.1 us")  # of a unit that nothing states
 YEARS = (946_684_800, 2_524_608_000)  # seconds since 1970 of the years 2000 to 2050
 # Steps between these are taken for seconds: larger ones may be milliseconds of a rate up to 50 kHz,
@@ -127,7 +127,7 @@ def is_clock(column: Column) -> bool:
     is_named = CLOCK_NAME.search(column.name)
     if column.forms or (is_named and column.odd):
         return not column.fixed
-    if not is_named or quantity_of(column.unit) or not column.usual_step:
+    if not is_named or column.unit in QUANTITIES or not column.usual_step:
         return False
     falls = (column.steps < 0).mean()
     return bool(min(falls, 1 - falls) <= FEW)
@@ -151,13 +151,13 @@ def is_counter(column: Column) -> bool:
     is_even = are_even(steps, usual)
     if COUNTER_NAME.fullmatch(column.name):
         return usual < 0 or not is_even
-    is_channel = quantity_of(column.unit) or any(name.search(column.name) for name in FORCES)
+    is_channel = column.unit in QUANTITIES or any(name.search(column.name) for name in FORCES)
     return is_even and usual not in (0, 1) and not is_channel and ANY not in column.name
 
 
 def are_even(steps: Floats, usual: float) -> bool:
     """Return whether no step differs from the usual one by more than 1 %; True without steps."""
-    return bool((np.abs(steps - usual) <= EVEN * abs(usual)).all())
+    return np.allclose(steps, usual, rtol=EVEN, atol=0.0)
 
 
 def epoch_of(column: Column) -> str:

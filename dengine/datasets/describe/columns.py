@@ -166,7 +166,7 @@ class Column:
         cells = {word for words in self.words for word in (*words[:MOST_CELLS], *words[-1:])}
         if not all(map(LIKE_A_TIME.match, cells)):
             return []
-        table = Table(self.name, {self.name: np.array(sorted(cells), dtype=object)}, [])
+        table = Table(self.name, {self.name: np.array(sorted(cells), dtype=object)})
         forms = list[str]()
         for form in FORMS:
             with suppress(DataError):

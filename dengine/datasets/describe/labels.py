@@ -75,12 +75,9 @@ PLACES = (  # of any words: folders, and the words of a file's name, counted fro
 )
 # What ends the beginning of a line: a mark, two blanks, or the blank before a date.
 NAME_END = re.compile(r"[;:：=\t,]|  |(?<=[^\W\d]) (?=\d+[-./]\d+[-./]\d)")
-LISTED = re.compile(r"\((?!\?)(?:[\w /|-]|\\\W)+\)")  # a group of words, with escaped marks
-NO_LABEL = "none was found that is certain: state label.column, path, line or listing"
 Names = Iterable[str]
 CHANCE = 0.05  # that two words go with the labels like this
 Words = Mapping[str, str]  # by recording
-Meanings = Mapping[str, int | None]  # 1 good, 0 bad, None not checked, by word
 Counted = Mapping[LabelSource, Words]
 
 
@@ -94,13 +91,11 @@ def with_meanings(source: LabelSource, words: Names) -> LabelSource:
     or in a path whose expression lists its words, like `(False|True)`; elsewhere they have no known
     meaning.
     """
-    words = sorted({*words})
     name = source.column or source.line or source.topic
     groups: Sequence[Sequence[str]] = (GOOD, BAD, UNCHECKED)
     if lists_words(source) or GOOD_NAME.fullmatch(name):
         groups = ((*GOOD, *YES), (*BAD, *NO), UNCHECKED)
-    stated = source.good + source.bad + source.unchecked
-    free = [word for word in words if word not in stated]
+    free = sorted({*words}.difference(source.good, source.bad, source.unchecked))
     goods, bads, others = (tuple(w for w in free if w.lower() in group) for group in groups)
     return replace(
         source,
@@ -112,7 +107,8 @@ def with_meanings(source: LabelSource, words: Names) -> LabelSource:
 
 def lists_words(source: LabelSource) -> bool:
     """Return whether a group in `source.path` spells out its words: `(ok|nok)`, not `([^/]+)`."""
-    return LISTED.search(source.path) is not None
+    group = r"\((?!\?)(?:[\w /|-]|\\\W)+\)"  # of words, with escaped marks
+    return re.search(group, source.path) is not None
 
 
 def in_paths(paths: Names) -> list[str]:
@@ -188,7 +184,7 @@ def tables_of(p: Proposal) -> list[Table]:
     looked_at = {table.source for table in p.tables}
     return [
         *p.tables,
-        *(Table(name, {}, [], path=name) for name in p.names if name not in looked_at),
+        *(Table(name, {}, path=name) for name in p.names if name not in looked_at),
     ]
 
 
@@ -319,7 +315,9 @@ def unmatched(p: Proposal, counted: Iterable[LabelSource]) -> Iterator[str]:
             )
 
 
-def may_contradict(source: LabelSource, words: Words, label: Words, meanings: Meanings) -> bool:
+def may_contradict(
+    source: LabelSource, words: Words, label: Words, meanings: Mapping[str, int | None]
+) -> bool:
     """Return whether a source that has words of unknown meaning may contradict the label.
 
     It may if one of its words stands on good and on bad recordings, and the source either is named
@@ -366,8 +364,8 @@ def doubt_on(label: LabelSource, counted: Counted, strays: Strings) -> str:
     return "the labels may stand in that listing" if strays else ""
 
 
-def are_one(named: Sequence[LabelSource], counted: Counted) -> bool:
-    """Return whether only one source may be the label, if none is certain.
+def doubt_among(named: Sequence[LabelSource], counted: Counted) -> str:
+    """Return why no source may be the label, if none is certain; "" if only one may be it.
 
     `counted` has the words of each source by recording, and `named` those sources that are named
     like a verdict or stated; there must be one. Sources that have the same word for each recording
@@ -375,7 +373,9 @@ def are_one(named: Sequence[LabelSource], counted: Counted) -> bool:
     """
     has_known = any(is_known(source, words) for source, words in counted.items())
     rivals = {tuple(counted[source].items()) for source in (counted if has_known else named)}
-    return len(rivals) == 1 and bool(named)
+    if len(rivals) == 1 and named:
+        return ""
+    return "none was found that is certain: state label.column, path, line or listing"
 
 
 def propose_label(p: Proposal) -> None:
@@ -386,9 +386,9 @@ def propose_label(p: Proposal) -> None:
     (`is_named_like_verdict`) or stated by the user, has words for good and for bad, and all its
     words have a known meaning. The first certain source becomes the label, unless another source
     contradicts it (`doubt_on`), or no source is stated and a listing with a verdict names too few
-    recordings (`unmatched`). If none is certain, but only one may be the label (`are_one`), this
-    source, the first that is named like a verdict or stated, becomes the label. Its `good` or `bad`
-    is `?` if none of its words is known to mean that; a word of unknown meaning is in neither list.
+    recordings (`unmatched`). If none is certain, but only one may be the label (`doubt_among`), it
+    becomes the label: the first that is named like a verdict or stated. Its `good` or `bad` is `?`
+    if none of its words is known to mean that; a word of unknown meaning is in neither list.
     Otherwise `label.column` is `?`, with a note that lists all sources, and the listings with a
     verdict that name too few recordings.
 
@@ -404,9 +404,7 @@ def propose_label(p: Proposal) -> None:
     named = [*counted] if stated else [*filter(is_named_like_verdict, counted)]
     certain = [s for s in named if is_known(s, counted[s]) and UNKNOWN not in s.good + s.bad]
     strays = [*unmatched(p, counted)]
-    doubt = "" if are_one(named, counted) else NO_LABEL
-    if certain:
-        doubt = doubt_on(certain[0], counted, strays)
+    doubt = doubt_on(certain[0], counted, strays) if certain else doubt_among(named, counted)
     if doubt:
         p.put(
             "label.column",
@@ -416,16 +414,11 @@ def propose_label(p: Proposal) -> None:
         return
     label = (certain or named)[0]
     words = counted[label]
-    others = [source for source in certain[1:] if counted[source].keys() >= words.keys()]
-    p.description = replace(p.description, label=label)
-    propose_checks(p, others)
+    checks = p.description.check
+    if not (checks or "check" in p.stated):
+        checks = tuple(s for s in certain[1:] if counted[s].keys() >= words.keys())
+    p.description = replace(p.description, label=label, check=checks)
     note_words(p, words)
-
-
-def propose_checks(p: Proposal, sources: Sequence[LabelSource]) -> None:
-    """Set `[[check]]` in `p`, the sources that must agree with the label, unless it is stated."""
-    if not (p.description.check or "check" in p.stated):
-        p.description = replace(p.description, check=tuple(sources))
 
 
 def note_words(p: Proposal, words: Words) -> None:

@@ -86,8 +86,9 @@ def _propose_part_column(p: Proposal, columns: Iterable[Column], runs: Sequence[
     """
     # The number of a part changes about as often as any other word.
     least = max((c.n_runs for c in runs), default=0) / 4
-    parts = [c for c in runs if PART_NAME.search(c.name) and c.n_runs >= least]
-    likely = [c.name for c in parts if len(c.counts) == c.n_runs]
+    likely = [
+        c.name for c in runs if PART_NAME.search(c.name) and len(c.counts) == c.n_runs >= least
+    ]
     named = [c.name for c in columns if PART_NAME.search(c.name) or has_long_runs(c)]
     note = f"one of {listed(named)}, or several, like {as_option('part.column', named[:2])}"
     if len(p.names) > 1:
@@ -102,8 +103,7 @@ def is_even_clock(column: Column) -> bool:
     samples, not parts.
     """
     is_long = CLOCK_NAME.search(column.name) and len(column.steps) >= LEAST_RUN
-    usual = column.usual_step
-    return bool(is_long and usual and are_even(column.steps, usual))
+    return bool(is_long and column.usual_step and are_even(column.steps, column.usual_step))
 
 
 def has_long_runs(column: Column) -> bool:

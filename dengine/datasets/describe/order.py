@@ -198,13 +198,11 @@ def unsorted_places(p: Proposal, tables: Tables) -> Iterator[tuple[str, str]]:
             yield place, source.column if can_sort else RENAME
 
 
-def _sources(p: Proposal) -> list[LabelSource]:
-    """Return the places where words may rise from recording to recording, see `unsorted_places`."""
-    sources = [LabelSource(column=column.name, at="first") for column in p.unused]
-    sources += [LabelSource(line=line) for line in lines_of(p)]
+def _sources(p: Proposal) -> Iterator[LabelSource]:
+    """Yield the places where words may rise from recording to recording, see `unsorted_places`."""
+    yield from (LabelSource(column=column.name, at="first") for column in p.unused)
+    yield from (LabelSource(line=line) for line in lines_of(p))
     for label in p.description.labels:
         with suppress(DataError):  # a label in no listing, or in one that cannot be read
-            sources += [
-                replace(label, column=name) for name in p.read_listing(label.listing).columns
-            ]
-    return sources
+            columns = p.read_listing(label.listing).columns
+            yield from (replace(label, column=name) for name in columns)

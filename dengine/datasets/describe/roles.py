@@ -15,6 +15,7 @@ from ..description import (
     UNKNOWN,
     PartSource,
     RowWords,
+    Strings,
     as_option,
     expect_one_of,
 )
@@ -247,7 +248,7 @@ def propose_channels(p: Proposal, units: Mapping[str, str]) -> None:
 
     It is the only likely one (`likely_channels`). The channels stay empty, with a note, if there is
     none or several, if the column is named like a set value, a limit or an error or stands for
-    columns that are not numbered evenly, like `x0`, `x1`, `x5` (`_doubt_on`), or if a unit, a
+    columns that are not numbered evenly, like `x0`, `x1`, `x5` (`_doubts_on`), or if a unit, a
     factor of scale or a sampling rate that the recordings state differs between them
     (`_other_scales`). Raises SettingError for a malformed `windows.trigger` (the condition at which
     a part begins).
@@ -257,7 +258,7 @@ def propose_channels(p: Proposal, units: Mapping[str, str]) -> None:
     if p.description.channels:
         return
     best = likely_channels(units)
-    doubts = [*filter(None, (*(_doubt_on(p, name) for name in best), *_other_scales(p)))]
+    doubts = [*_doubts_on(p, best), *_other_scales(p)]
     if len(best) == 1 and not doubts:
         p.put("channels", {best[0]: units[best[0]]})
         return
@@ -284,21 +285,23 @@ def likely_channels(units: Mapping[str, str]) -> list[str]:
     return best if {*best} & {*forces} else [*best, *forces]
 
 
-def _doubt_on(p: Proposal, name: str) -> str:
-    """Return the first reason why a column may not be a channel; "" if there is none.
+def _doubts_on(p: Proposal, names: Strings) -> Iterator[str]:
+    """Yield the first reason why a column may not be a channel, for each that has one.
 
     The reasons: the column is named like a value that a controller aims at or like a limit
-    (`F_soll`, `set_force`, `F_max`); `name` is like `x*` and stands for the columns `x0`, `x1`, ...
-    of the first of `p.tables`, and these numbers do not rise evenly (`is_numbering`). `p` is the
-    description so far, and `p.tables` are the recordings that are looked at.
+    (`F_soll`, `set_force`, `F_max`); its name is like `x*` and stands for the columns `x0`, `x1`,
+    ... of the first of `p.tables`, and these numbers do not rise evenly (`is_numbering`). `p` is
+    the description so far, and `p.tables` are the recordings that are looked at.
+
+    names : of the columns.
     """
-    if SET_VALUE.search(name):
-        return f"{name} may be no measurement, but a set value, a limit or an error"
-    names = p.tables[0].origin.get(name, ()) if p.tables else ()
-    numbers = [match[1] for match in match_numbered(name, names)]
-    if not numbers or is_numbering(numbers):
-        return ""
-    return f"{name} is not numbered evenly"
+    origin = p.tables[0].origin if p.tables else {}
+    for name in names:
+        numbers = [match[1] for match in match_numbered(name, origin.get(name, ()))]
+        if SET_VALUE.search(name):
+            yield f"{name} may be no measurement, but a set value, a limit or an error"
+        elif numbers and not is_numbering(numbers):
+            yield f"{name} is not numbered evenly"
 
 
 def _other_scales(p: Proposal) -> Iterator[str]:
@@ -375,7 +378,7 @@ def far_outliers(column: Column) -> dict[str, int]:
     words = np.array([word for word in column.counts if word not in column.odd], dtype=object)
     found = dict[str, int]()
     with suppress(DataError):
-        numbers = Table(column.name, {column.name: words}, []).numbers(column.name, column.form)
+        numbers = Table(column.name, {column.name: words}).numbers(column.name, column.form)
         order = np.argsort(numbers).tolist()
         while len(order) > 3:
             steps = np.diff(numbers[order])

@@ -295,8 +295,8 @@ def _propose_keys(p: Proposal, looks: Sequence[Look]) -> None:
         form = replace(form, header=usual.line, units=units, data=form.data - above)
     if form.encoding == LATIN:
         p.put("text.encoding", LATIN, f"{LATIN} reads any text: look at the letters below")
-    names = () if p.stated.get("text.header") else tuple(_column_names(usual))
-    for key, value in asdict(replace(form, names=names)).items():
+    names = () if p.stated.get("text.header") else _column_names(usual)
+    for key, value in (asdict(form) | {"names": names}).items():
         p.put(f"text.{key}", value)
     cells = {*chain.from_iterable(row for item in looks for row in item.rows)}
     propose_marks(p, [*filter(NUMBER.fullmatch, cells)])

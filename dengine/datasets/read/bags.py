@@ -22,7 +22,7 @@ from .files import caught, first_of
 from .frames import read_frame
 from .split import signals_of, verdicts_of
 
-SUFFIX = ".mcap"
+BAG = ".mcap"  # suffix
 STAMP = "stamp"
 LOG_TIME = "log_time"
 PLACE = "place"
@@ -37,7 +37,7 @@ def read_messages(path: Path, topics: Collection[str] | None) -> Iterator[tuple[
     or if a package that reads such files is not installed. If the file is damaged, was not closed
     or cannot be read, the whole messages are yielded first; then UnreadableError is raised.
     """
-    if path.suffix.lower() != SUFFIX:
+    if path.suffix.lower() != BAG:
         raise DataError(
             f"Expected MCAP files in a bag, got {path.name}; `ros2 bag convert` makes them of .db3 "
             "files."

@@ -10,12 +10,20 @@ from ..description import Clock, TextForm
 from ..table import Table, UnreadableError
 from ..units import bare
 
-UNITS = {"s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9}
-UNITS |= {"min": 60.0, "h": 3600.0, "d": 86400.0}
+UNITS = {  # in seconds
+    "s": 1.0,
+    "sec": 1.0,
+    "ms": 1e-3,
+    "us": 1e-6,
+    "µs": 1e-6,
+    "ns": 1e-9,
+    "min": 60.0,
+    "h": 3600.0,
+    "d": 86400.0,
+}
 ISO = "iso"
 DAY = UNITS["d"]
 RATE_TOLERANCE = 0.03  # by which the rate of a recording's own times may differ from the stated one
-DATES = re.compile(r"%[dDjeyYxcmbB]")
 
 
 def is_dated(unit: str) -> bool:
@@ -31,7 +39,7 @@ def has_day(unit: str) -> bool:
 
     `unit` is its format in `[time]`: `iso`, or a form with a sign like `%d` or `%Y`.
     """
-    return unit == ISO or DATES.search(unit) is not None
+    return unit == ISO or re.search("%[dDjeyYxcmbB]", unit) is not None
 
 
 def scale_of(unit: str) -> float:
@@ -136,8 +144,7 @@ def _dates(table: Table, name: str, unit: str, clock: Clock) -> Floats:
             times = times.dt.tz_localize((has_day(unit) and clock.zone) or "UTC", ambiguous="infer")
     table.refuse(times.isna().to_numpy(), f"a time of the form {unit}", name)
     zero = pd.Timestamp("1970-01-01" if has_day(unit) else "1900-01-01", tz="UTC")
-    seconds: Floats = (times - zero).dt.total_seconds().to_numpy(np.float64)
-    return seconds
+    return np.asarray((times - zero).dt.total_seconds())
 
 
 def check_steps(seconds: Floats, clock: Clock, table: Table) -> None:
@@ -153,7 +160,7 @@ def check_steps(seconds: Floats, clock: Clock, table: Table) -> None:
     rate = clock.rate_hz
     column = " + ".join(clock.column)
     n = len(steps)
-    span = float(seconds[-1] - seconds[0])
+    span = seconds[-1] - seconds[0]
     most = clock.gap / rate if rate else clock.gap * span / max(n, 1)
     is_bad = steps <= 0 if clock.gap or not span else steps < 0
     is_bad |= steps > (most or np.inf)

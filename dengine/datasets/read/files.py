@@ -14,9 +14,7 @@ from ..dataset import Fault, Faults
 from ..description import FOLDER_FILE, Description, Strings
 from ..table import UnreadableError
 
-GZIP = ".gz"
 DATE = re.compile(r"(?<![0-9])([0-9]{1,2})\.([0-9]{1,2})\.([0-9]{4})(?![0-9])")
-DECIMAL = re.compile(r"[0-9]+(\.[0-9]*)?([eE]\+?[0-9]+)?")
 HALF_DAY = re.compile(r"\d ?[aApP][mM](?![A-Za-z])")
 # Dates and times that are in another order than the numbers in them.
 UNSORTED = re.compile(
@@ -56,7 +54,8 @@ def sort_key(word: str) -> list[Any]:
 
     Numbers with a sign or a negative exponent, like -5 and 1e-3, are such other words.
     """
-    return ["", float(word), ""] if DECIMAL.fullmatch(word) else natural_key(word)
+    is_decimal = re.fullmatch(r"[0-9]+(\.[0-9]*)?([eE]\+?[0-9]+)?", word)
+    return ["", float(word), ""] if is_decimal else natural_key(word)
 
 
 def as_source(source: Any) -> Any:
@@ -122,7 +121,7 @@ def read_file(path: Path) -> bytes:
         before = path.stat()
         content = path.read_bytes()
         after = path.stat()
-        if path.suffix.lower() == GZIP:
+        if path.suffix.lower() == ".gz":
             content = gzip.decompress(content)
     if (before.st_mtime_ns, before.st_size) != (after.st_mtime_ns, after.st_size):
         raise UnreadableError("Expected a file that stays, it changed while it was read")

@@ -45,7 +45,7 @@ def read_objects(content: bytes, source: str, form: TextForm, has_lines: bool) -
         for item in value if isinstance(value, list) else [value]:
             if not isinstance(item, Mapping):
                 raise UnreadableError(f"Expected an object of JSON, got {shortened(item)}", number)
-            rows.append((number, flat("", item)))
+            rows.append((number, flat(item)))
     return _table_of(source, rows, "objects of JSON")
 
 
@@ -178,7 +178,7 @@ def read_npz(content: bytes, source: str, has_all: bool) -> Table:
         raise UnreadableError("Expected arrays, got none")
     columns = {k: np.atleast_1d(x if has_all else np.squeeze(x)) for k, x in arrays.items()}
     if not has_all:
-        return Table(source, columns_of("", columns), [])
+        return Table(source, columns_of("", columns))
     return Table(source, columns, range(1, len(max(columns.values(), key=np.size)) + 1))
 
 

@@ -20,7 +20,6 @@ from .text import read_text, to_utf8_or_latin
 
 ListingReader = Callable[[str], Table]  # returns the table of the listing of a name
 DELIMITERS = (",", ";", "\t", "|")
-SUFFIX = re.compile(r"\.[A-Za-z]\w{0,7}(\.gz)?$")  # of a file
 MARKS = " \t;,:：=\"'"  # around the words of a line
 
 
@@ -46,7 +45,7 @@ def without_suffix(path: str) -> str:
     A suffix is a point, a letter, and up to seven more letters, digits or `_`; so `run_0.5` has
     none.
     """
-    return SUFFIX.sub("", path)
+    return re.sub(r"\.[A-Za-z]\w{0,7}(\.gz)?$", "", path)
 
 
 def path_word(path: str, pattern: str) -> str:

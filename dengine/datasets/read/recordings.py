@@ -232,7 +232,7 @@ def read_recordings(
         read_labels(label, lambda name: listing_table(base / name, description.text))
         for label in description.labels
     ]
-    recordings: list[Recording] = []
+    recordings = list[Recording]()
     n_unlabelled = 0
     for file in files:
         with caught(faults, file.source if isinstance(file, Table) else file):
