@@ -303,17 +303,18 @@ class TraceGate(nn.Module):
         lowest, highest = torch.aminmax(x)
         low = float(lowest.item())  # NaN if there is one anywhere in the trace
         high = float(highest.item())
+        size = max(high, -low)
         reason = 0
         if not (low > -float("inf") and high < float("inf")):
             reason = self.not_finite
             x = torch.nan_to_num(x, 0.0, 0.0, 0.0)
         elif low == high:
             reason = self.constant
-        elif max(high, -low) >= limit:
+        elif size >= limit:
             reason = self.saturated
-        elif max(high, -low) > self.largest:
+        elif size > self.largest:
             reason = self.too_large
-        if not max(high, -low) <= self.clamp:  # true of NaN as well
+        if not size <= self.clamp:  # true of NaN as well
             x = x.clamp(-self.clamp, self.clamp)
         # Exact in float32, for the quantum is a power of two.
         steps = (x.view(-1) * self.quantum).floor_().to(torch.int64)

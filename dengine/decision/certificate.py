@@ -186,7 +186,7 @@ def _run_length(share: float, step: int, limit: int) -> float:
     # The mean from the sum s is a[s] + b[s] t, where t is the mean from the largest sum; it is
     # computed downwards, and the equation at 0 gives t. At and beyond the limit both are 0.
     a = [0.0] * (limit + step)
-    b = [0.0] * (limit + step)
+    b = a.copy()
     b[limit - 1] = 1.0
     for s in range(limit - 1, 0, -1):
         a[s - 1] = (a[s] - 1.0 - share * a[s + step]) / (1.0 - share)

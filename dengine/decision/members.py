@@ -199,23 +199,22 @@ class MemberEvidence(nn.Module):
         self.recovery_minimum = math.log(1.0 / alpha)
         self.level_steps = [log_capital_steps(t, inclusion_probability) for t in tolerances]
         self.level_minimum = [self.recovery_minimum] * 2
-        self.recovery_steps = self.level_steps
         self.fewest_since_alarm = 0.0
+        if kind == "priced":
+            self.level_steps = [
+                [t, -1.0, t / inclusion_probability, -1.0 / inclusion_probability]
+                for t in tolerances
+            ]
+            self.level_minimum = [-OVERDRAFT, 0.0]
+            self.max_recent_errors = [N_RECENT] * 2  # the account and the detectors are enough
+            self.recovery_minimum = 0.0
+            self.fewest_since_alarm = FEWEST_SINCE_ALARM
+        self.recovery_steps = self.level_steps
         if self.is_watched:
             # Of the log likelihood ratio of the tolerance to its double. If the share of wrong
             # parts is doubled, it ever reaches log(1 / alpha) with a probability of at most alpha.
             right_steps = [math.log((1.0 - t) / (1.0 - 2.0 * t)) for t in tolerances]
             self.recovery_steps = [[step, -math.log(2.0) - step] * 2 for step in right_steps]
-        elif kind == "priced":
-            self.level_steps = [
-                [t, -1.0, t / inclusion_probability, -1.0 / inclusion_probability]
-                for t in tolerances
-            ]
-            self.recovery_steps = self.level_steps
-            self.level_minimum = [-OVERDRAFT, 0.0]
-            self.max_recent_errors = [N_RECENT] * 2  # the account and the detectors are enough
-            self.recovery_minimum = 0.0
-            self.fewest_since_alarm = FEWEST_SINCE_ALARM
         # Of a detector, what a wrong part adds, where a right one takes 1, and the alarm's limit.
         detectors = [cusum(share, FALSE_ALARMS / alpha) for share in (*tolerances, NOVEL_SHARE)]
         self.error_steps = [float(step) for step, _ in detectors]
@@ -373,9 +372,10 @@ class MemberEvidence(nn.Module):
         if n_reached == 0 and not is_member:
             return
         first = n_levels - n_reached
-        slots = self.level_totals[side, first:].unsqueeze(1) % self.n_recent  # of the oldest
+        totals = self.level_totals[side, first:]
+        slots = totals.unsqueeze(1) % self.n_recent  # of the oldest
         self.recent_errors[side, first:].scatter_(1, slots, int(wrong))
-        self.level_totals[side, first:].add_(1)
+        totals.add_(1)
         n_columns = 1 + int(wrong)  # parts, and wrong parts
         self.level_counts_since_alarm[side, first:, audited, :n_columns].add_(1)
         if is_member:
@@ -445,11 +445,12 @@ class MemberEvidence(nn.Module):
         threshold, which becomes the first level again once the members since the alarm show
         recovery.
         """
+        threshold = self.thresholds[side]
         is_recovered = self.members_to_recovery(side) <= 0.0
         if self.is_watched:  # only an alarm closes it
-            if is_recovered and float(self.thresholds[side].item()) >= self.closed:
+            if is_recovered and float(threshold.item()) >= self.closed:
                 # Assigned to an element, a float of TorchScript would go through float32.
-                self.thresholds[side].fill_(self.levels[side][0])
+                threshold.fill_(self.levels[side][0])
             return
         members: list[int] = self.member_counts[side].flatten().tolist()
         since: list[int] = self.member_counts_since_alarm[side].flatten().tolist()
@@ -466,7 +467,7 @@ class MemberEvidence(nn.Module):
             since == members and int(self.safe_mode.item()) == SafeMode.NONE.value
         )
         opens = target >= 0 and may_open and self.allows_more(side, members)
-        self.thresholds[side].fill_(self.levels[side][target] if opens else self.closed)
+        threshold.fill_(self.levels[side][target] if opens else self.closed)
 
     def allows_more(self, side: int, counts: list[int]) -> bool:
         """Return whether the evidence of these counts suffices to let more such parts pass.

@@ -243,9 +243,10 @@ def fit_novelty(traces: TraceArray, margin: float, parts: Ints | None = None) ->
         points = standard[:, group]
         limit, reach = _usual_distance_and_reach(points, same)
         limit = max(least, margin * max(1.0, n_needed / n_distinct) * limit)
-        gate.offset[i, group] = (limit**-0.5 * offset[group]).float()
-        gate.gain[i, group] = (limit**-0.5 * gain[group]).float()
-        gate.points[group, : len(points)] = limit**-0.5 * points.t()
+        factor = limit**-0.5
+        gate.offset[i, group] = (factor * offset[group]).float()
+        gate.gain[i, group] = (factor * gain[group]).float()
+        gate.points[group, : len(points)] = factor * points.t()
         gate.norms[i] = float("inf")
         farther = (margin * reach / limit - 1.0).clamp(min=0.0)
         gate.norms[i, : len(points)] = points.square().sum(1) / limit - farther

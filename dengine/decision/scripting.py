@@ -65,9 +65,7 @@ def attributes_of(module: nn.Module) -> dict[str, Any]:
     Plain attributes are those of the object itself, `training` among them, except the ones in which
     torch keeps parameters, submodules and hooks.
     """
-    plain = dict(vars(module))
-    for name in INTERNAL & plain.keys():
-        del plain[name]
+    plain = {name: value for name, value in vars(module).items() if name not in INTERNAL}
     plain |= module.named_parameters(recurse=False, remove_duplicate=False)
     plain |= module.named_buffers(recurse=False, remove_duplicate=False)
     return plain

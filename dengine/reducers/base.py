@@ -344,17 +344,15 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
         if not reset:
             check_is_fitted(self)
         # Writeable, since torch warns of an array that it could not write to.
-        x = np.asarray(
-            check_array(
-                X,
-                dtype=np.float32,
-                order="C",
-                allow_nd=True,
-                force_writeable=True,
-                ensure_min_samples=int(reset),
-                estimator=self,
-                input_name="X",
-            )
+        x: Floats = check_array(
+            X,
+            dtype=np.float32,
+            order="C",
+            allow_nd=True,
+            force_writeable=True,
+            ensure_min_samples=int(reset),
+            estimator=self,
+            input_name="X",
         )
         if x.ndim > 3 or 0 in x.shape[1:]:
             raise TraceError(
@@ -363,6 +361,7 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
             )
         is_table = x.ndim == 2
         traces = x[:, None, :] if is_table else x
+        shape = traces.shape[1:]
         if reset or is_table:  # only a table's columns have names and a number to compare
             validate_data(
                 self, X if is_table else as_rows(traces), reset=reset, skip_check_array=True
@@ -376,10 +375,10 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
                 "check the sensor, or use a smaller unit",
                 TraceError,
             )
-            self.trace_shape_ = traces.shape[1:]
-        elif traces.shape[1:] != self.trace_shape_:
+            self.trace_shape_ = shape
+        elif shape != self.trace_shape_:
             expected = "{} channels x {} samples".format(*self.trace_shape_)
-            actual = "{} channels x {} samples".format(*traces.shape[1:])
+            actual = "{} channels x {} samples".format(*shape)
             raise TraceError(
                 f"Expected traces of {expected}, as in fit, got {actual}; resample, or fit anew."
             )
@@ -398,9 +397,8 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
         tags = super().__sklearn_tags__()
         tags.target_tags.required = self.uses_labels
         if self.uses_labels:
-            tags.classifier_tags = ClassifierTags(
-                multi_class=False
-            )  # no classifier, but its labels are of two classes
+            # No classifier, but its labels are of two classes.
+            tags.classifier_tags = ClassifierTags(multi_class=False)
         tags.transformer_tags.preserves_dtype = ["float32"]
         return tags
 
@@ -515,7 +513,8 @@ def space_scale(points: Floats, folds: Ints, n_spaces: int) -> Floats:
             rms = float(np.sqrt(((inside - inside.mean(axis=0)) ** 2).sum(axis=1).mean()))
             # The mean of equal points may differ from them by rounding.
             rounding = 1e-12 + 1e-6 * float(np.abs(inside).max())
-            scale[k] = rms if np.isfinite(rms) and rms > rounding else 1.0
+            if np.isfinite(rms) and rms > rounding:
+                scale[k] = rms
     return scale
 
 
@@ -565,7 +564,7 @@ def binary_labels(y: Any, n: int, name: str) -> Ints:
     return np.asarray(labels == classes[-1], dtype=np.int64)
 
 
-def folds_of(traces: Floats, n_folds: int, folds: Any = None) -> Ints:
+def folds_of(traces: Floats, n_folds: int, folds: Any) -> Ints:
     """Return the folds of traces (n, C, T), int64 (n,): those given, or by a hash of each trace.
 
     A fold is a group of traces for cross-fitting. Given folds are cast to int64, so decimals are

@@ -374,15 +374,14 @@ class RocketReducer(ProbabilityReducer):
         `net_` is the module that embeds traces; its heads are logistic regressions on the features
         that the convolution kernels give. The caller sets the kernels, and then makes
         `is_initialized_` True, which becomes False here. `average` is the number of samples that
-        are averaged to one. `trace_shape_`, `n_features_in_` and `average_` are set. `towers_` (the
-        groups of features with their heads) and the cache of features become empty, `n_fits_` (the
-        number of fits) and `n_component_traces_` (of the traces from which principal components
-        were computed) 0; what a fit reports (`n_iter_`, `holdout_losses_`) stays. Raises
-        SettingError for a parameter out of its range or fewer than 2 samples.
+        are averaged to one. `trace_shape_` and `average_` are set. `towers_` (the groups of
+        features with their heads) and the cache of features become empty, `n_fits_` (the number of
+        fits) and `n_component_traces_` (of the traces from which principal components were
+        computed) 0; what a fit reports (`n_iter_`, `holdout_losses_`) stays. Raises SettingError
+        for a parameter out of its range or fewer than 2 samples.
         """
         self.check()
         self.trace_shape_ = (channels, samples)
-        self.n_features_in_ = channels * samples
         self.average_ = average
         encoder = RocketEncoder(
             channels,
@@ -578,6 +577,7 @@ class RocketReducer(ProbabilityReducer):
             net.weight[columns, 1 : net.n_scores : 2] = second[:, None]
             net.bias[1 : net.n_scores : 2] = -(f.mean(0) @ second)
 
+    @torch.no_grad()
     def raw_features(self, traces: Floats, numbers: Ints | None = None) -> Tensor:
         """Return the unscaled features (n, P) of traces (n, C, T), as a tensor.
 
@@ -588,13 +588,12 @@ class RocketReducer(ProbabilityReducer):
         and shares its memory with the returned tensor, so change neither. Without numbers the cache
         is neither read nor written.
         """
-        with torch.no_grad():
-            return torch.from_numpy(
-                self._raw.update(
-                    numbers,
-                    lambda index: compute_raw_features(self.net_.encoder, traces[index]).numpy(),
-                )
+        return torch.from_numpy(
+            self._raw.update(
+                numbers,
+                lambda index: compute_raw_features(self.net_.encoder, traces[index]).numpy(),
             )
+        )
 
     @property
     def report(self) -> FitReport:

@@ -193,9 +193,8 @@ class RocketEncoder(nn.Module):
         left out. The scaled values are clipped at ±1e6.
         """
         if self.average > 1:
-            x = x[..., self.skipped :] if self.skipped > 0 else x
             # In half the time of a mean over an axis.
-            x = nn.functional.avg_pool2d(x, [1, self.average])
+            x = nn.functional.avg_pool2d(x[..., self.skipped :], [1, self.average])
         # Without the limits products of huge values would overflow.
         return torch.addcmul(self.shift, x, self.scale).clamp_(-1e6, 1e6)
 
@@ -316,11 +315,11 @@ class RocketEncoder(nn.Module):
         # Low-discrepancy quantiles, as in MiniRocket; none at the very ends.
         n = self.n_dilations * self.n_kernels
         quantiles = 0.05 + 0.9 * (np.arange(1, n + 1) * (np.sqrt(5.0) + 1.0) / 2.0 % 1.0)
+        quantiles = quantiles.reshape(self.n_dilations, self.n_kernels)
         dense = self.as_windows(values[:, : self.n_dense_taps], self.n_dilations)
         for d, windows in enumerate(dense):  # (C * 9, P * n)
             answers = (kernels @ windows).numpy()
-            of_dilation = quantiles[d * self.n_kernels : (d + 1) * self.n_kernels]
-            ranks = (of_dilation * (answers.shape[1] - 1)).astype(np.int64)
+            ranks = (quantiles[d] * (answers.shape[1] - 1)).astype(np.int64)
             thresholds = [
                 np.partition(row, rank)[rank] for row, rank in zip(answers, ranks, strict=True)
             ]

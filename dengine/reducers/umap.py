@@ -463,8 +463,7 @@ class UmapReducer(Reducer):
         Raises NotFittedError before a fit, and the errors of `check_traces`, such as ValueError for
         traces of another shape.
         """
-        check_is_fitted(self, "encoder_")
-        return embed_in_chunks(self.encoder_, torch.from_numpy(self.check_traces(X)), CHUNK)
+        return embed_in_chunks(self.module(), torch.from_numpy(self.check_traces(X)), CHUNK)
 
     def untrained_module(self, X: Floats) -> UmapEncoder:
         """Return a module that can be compiled before the training on traces X (n, C, T).
