@@ -50,7 +50,7 @@ def label_agreement(
     Parameters
     ----------
     points : array of float32, shape (n, d)
-        Reference points, the oldest first; only the last 3000 (`SAMPLE`) are used.
+        Reference points. The work grows with the square of their number.
     labels : array of int, shape (n,)
         1 is success, 0 is failure.
     spaces : array of int64, shape (n,)
@@ -65,10 +65,6 @@ def label_agreement(
         Upper confidence bound on the intraclass correlation, one-sided at 95 %, from 0 to 1; 1 if
         fewer than 20 (`FEWEST_PARTS`) known parts are among these points at least twice.
     """
-    points = points[-SAMPLE:]
-    labels = labels[-SAMPLE:]
-    spaces = spaces[-SAMPLE:]
-    parts = parts[-SAMPLE:]
     _, part, n_times = np.unique(parts, return_inverse=True, return_counts=True)
     is_repeated = (n_times[part] > 1) & (parts != 0)
     repeated = part[is_repeated]
@@ -423,13 +419,12 @@ class RadiusIndex(nn.Module):
         """Set `agreement`, how strongly labels of one part agree, for all counts from now on.
 
         When the labels near a trace are counted, m labels of one part are worth m / (1 + (m - 1) *
-        `agreement`) votes. It is computed from the points in the index (`label_agreement`). Nothing
-        changes if no part has several points in it.
+        `agreement`) votes. It is computed from the last 3000 points (`SAMPLE`) in the index, see
+        `label_agreement`. Nothing changes if no part has several points in it.
         """
         if int(self.repeats) > 0:
-            self.agreement.fill_(
-                label_agreement(*map(self.column, ("points", "labels", "spaces", "parts")))
-            )
+            newest = (self.column(name)[-SAMPLE:] for name in COLUMNS[:4])
+            self.agreement.fill_(label_agreement(*newest))
 
     def get_state(self) -> State:
         """Return copies of the arrays of the index, by name, from which `from_state` restores it.
