@@ -124,7 +124,7 @@ def failure_bound(n: int, n_bad: int, alpha: float, propensity: float = 1.0) -> 
             f"Expected 0 <= n_bad <= n, got n_bad = {n_bad} of n = {n}; count each part once."
         )
     enough = math.log(1.0 / alpha)
-    if propensity == 0.0 or log_evidence(n, n_bad, 1.0, propensity) < enough:
+    if log_evidence(n, n_bad, 1.0, propensity) < enough:
         return 1.0
     low = 0.0
     high = 1.0

@@ -209,8 +209,6 @@ def fit_novelty(traces: TraceArray, margin: float, parts: Ints | None = None) ->
     """
     n, channels, samples = traces.shape
     gate = NoveltyGate(channels, samples)
-    if n < FEWEST:
-        return gate
     chosen = np.linspace(0, n - 1, min(n, REFERENCES)).round().astype(np.intp)  # evenly in time
     same, n_distinct = _find_same(traces[chosen], None if parts is None else parts[chosen])
     if n_distinct < FEWEST:
@@ -226,9 +224,8 @@ def fit_novelty(traces: TraceArray, margin: float, parts: Ints | None = None) ->
     offset, gain = _standardise(features)
     standard = torch.addcmul(offset, features, gain).float()
     is_sound = standard.abs().amax(1) < 1e15  # the square of a larger distance would overflow
-    if not is_sound.all():
-        standard = standard[is_sound]
-        same = same[is_sound][:, is_sound]
+    standard = standard[is_sound]
+    same = same[is_sound][:, is_sound]
     kinds = torch.cat([kinds, torch.full((DISTORTIONS,), 5)])
     # The features of each group, the traces that its limit needs, and its least limit. Of fewer
     # traces the farthest stands for the quantile: the tail beyond it is taken as 1 / d^2. And of
@@ -265,9 +262,7 @@ def _noise_floor(gate: NoveltyGate, x: Tensor) -> Tensor:
     half of the traces or more: any movement there is then far away.
     """
     n_samples = x.size(2)
-    steps = torch.zeros(x.size(1))
-    if n_samples > 1:
-        steps = torch.linalg.vector_norm(torch.diff(x), dim=2).median(0).values
+    steps: Tensor = torch.linalg.vector_norm(torch.diff(x), dim=2).median(0).values
     # In the order of `plain_features`: first and second differences of segments, then brief ones.
     lengths = torch.tensor(
         [*2 * gate.segments * [gate.length], 2 * gate.brief, gate.brief, gate.brief]

@@ -280,15 +280,13 @@ class RadiusIndex(nn.Module):
             one part count as one to m votes, depending on how strongly labels of a part agree
             (`count_votes`), and the sums are rounded to whole numbers.
         """
-        n = distances.size(0)
-        if n == 0:
-            return 0, 0
         limit = radius * radius
         if int(self.repeats.item()) > 0:
             return self.count_votes(distances <= limit)
         # In float32, as the product takes it; the sums are exact below 2**24 points.
         inside = torch.le(distances, limit, out=torch.empty_like(distances))
-        counts: list[float] = torch.mv(self.labels.narrow(1, 0, n), inside).tolist()
+        labels = self.labels.narrow(1, 0, distances.size(0))
+        counts: list[float] = torch.mv(labels, inside).tolist()
         return int(counts[1]), int(counts[0]) - int(counts[1])
 
     def count_votes(self, inside: Tensor) -> tuple[int, int]:

@@ -56,10 +56,9 @@ def load_checkpoint(members: Members, path: str | Path) -> None:
         f"others in {path}",
         "train it and write them with save_checkpoint",
     )
-    with torch.no_grad():
-        for name, value in state.items():
-            weight = weights[names[name]]
-            value.view(-1, *weight.shape).copy_(weight)  # the same weights for each copy
+    for name, value in state.items():
+        weight = weights[names[name]]
+        value.view(-1, *weight.shape).copy_(weight)  # the same weights for each copy
 
 
 def read_tensors(path: str | Path) -> dict[str, Tensor]:

@@ -434,33 +434,32 @@ class RocketReducer(ProbabilityReducer):
         see the label of row i.
         """
         raw = self.raw_features(traces, numbers)
-        with torch.no_grad():
-            if len(raw) >= GROWTH * self.n_component_traces_ or self.n_fits_ % REFRESH_EVERY == 0:
-                self._compute_components(raw)
-            min_steps = 0 if self.n_fits_ else MIN_FIRST_STEPS
-            rows = sample_rows(len(raw), numbers)
-            f = self.net_.encoder.scale_features(raw[rows])
-            y = torch.from_numpy(labels[rows])
-            outside = torch.from_numpy(self.training_masks(folds[rows]))
-            fits = [
-                fit_heads(
-                    tower.components(features),
-                    y,
-                    outside,
-                    tower.w,
-                    self.l2,
-                    self.max_iter,
-                    stop,
-                    min_steps,
-                )
-                for tower, features in zip(self.towers_, self._tower_features(f), strict=True)
-            ]
-            self.towers_ = [
-                tower._replace(w=fit.w) for tower, fit in zip(self.towers_, fits, strict=True)
-            ]
-            penalties = [0.0] * (len(fits) - 1) + [PRODUCT_PENALTY]
-            shares, losses = weigh_towers([fit.left_out for fit in fits], penalties, y, outside)
-            self._set_heads(shares)
+        if len(raw) >= GROWTH * self.n_component_traces_ or self.n_fits_ % REFRESH_EVERY == 0:
+            self._compute_components(raw)
+        min_steps = 0 if self.n_fits_ else MIN_FIRST_STEPS
+        rows = sample_rows(len(raw), numbers)
+        f = self.net_.encoder.scale_features(raw[rows])
+        y = torch.from_numpy(labels[rows])
+        outside = torch.from_numpy(self.training_masks(folds[rows]))
+        fits = [
+            fit_heads(
+                tower.components(features),
+                y,
+                outside,
+                tower.w,
+                self.l2,
+                self.max_iter,
+                stop,
+                min_steps,
+            )
+            for tower, features in zip(self.towers_, self._tower_features(f), strict=True)
+        ]
+        self.towers_ = [
+            tower._replace(w=fit.w) for tower, fit in zip(self.towers_, fits, strict=True)
+        ]
+        penalties = [0.0] * (len(fits) - 1) + [PRODUCT_PENALTY]
+        shares, losses = weigh_towers([fit.left_out for fit in fits], penalties, y, outside)
+        self._set_heads(shares)
         self.n_iter_ = max(fit.n_steps for fit in fits)
         self.holdout_losses_ = losses.numpy()
         self.n_fits_ += 1
@@ -577,7 +576,6 @@ class RocketReducer(ProbabilityReducer):
             net.weight[columns, 1 : net.n_scores : 2] = second[:, None]
             net.bias[1 : net.n_scores : 2] = -(f.mean(0) @ second)
 
-    @torch.no_grad()
     def raw_features(self, traces: Floats, numbers: Ints | None = None) -> Tensor:
         """Return the unscaled features (n, P) of traces (n, C, T), as a tensor.
 

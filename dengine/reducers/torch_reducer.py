@@ -351,7 +351,6 @@ class TorchReducer(ProbabilityReducer):
         self.n_steps_left_ = max(0, n_missing) if stop.max_steps is None else 0
         return points
 
-    @torch.no_grad()
     def _preprocess(self, traces: Floats) -> Tensor:
         """Return traces (n, C, T) averaged and standardised by `preprocessor_`, without gradients.
 
@@ -626,7 +625,6 @@ class TorchReducer(ProbabilityReducer):
             "averaged.": self.averaged_members_,
         }
 
-    @torch.inference_mode()
     def _embed_ramp(self) -> Floats:
         """Return the points (1, K, d) of a fixed trace, by which `set_state` knows the network.
 
