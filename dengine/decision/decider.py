@@ -79,7 +79,7 @@ class Decider(nn.Module):
         super().__init__()
         spec = conditions.trace
         self.predictor: Any = predictor
-        self.gate = trace_gate(spec.channels * spec.samples)
+        self.gate = trace_gate(spec.channels, spec.samples)
         self.limits = ForceLimitsGate(conditions.force_limits, spec)
         self.n_spaces, self.dim = embedding_shape
         self.audit_reason = REASONS.index(Reason.AUDIT)
@@ -225,6 +225,10 @@ def decider_without_model(conditions: DecisionConditions, reason: Reason) -> Dec
     return Decider(VerifyAll(reason), conditions)
 
 
-# The gate of a number of samples, C * T. It has no state, so all deciders share it; the gates of
-# the 16 numbers that were used last are cached.
-trace_gate = lru_cache(16)(TraceGate)
+@lru_cache(16)
+def trace_gate(channels: int, samples: int) -> TraceGate:
+    """Return the module that checks traces (C, T) of this shape for faults and hashes them.
+
+    It is cached (the 16 shapes that were used last): it has no state, so all deciders share it.
+    """
+    return TraceGate(channels * samples)
