@@ -44,7 +44,6 @@ class Preprocessor(nn.Module):
         self.register_buffer("scale", torch.ones(channels, 1))
         self.register_buffer("difference_scale", torch.ones(channels, 1))
 
-    @torch.jit.unused
     def learn(self, traces: Tensor) -> None:
         """Set the mean and scale of each channel, and the scale of its differences, in place.
 

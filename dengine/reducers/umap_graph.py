@@ -60,7 +60,6 @@ class Frames(nn.Module):
         self.register_buffer("centre", torch.zeros(channels, samples))
         self.register_buffer("scale", torch.ones(1))
 
-    @torch.jit.unused
     def learn(self, traces: Tensor) -> None:
         """Set centre and scale of a new module, in place, from traces (n, C, T).
 
