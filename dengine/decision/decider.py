@@ -185,8 +185,8 @@ class Decider(nn.Module):
         because tensors of int64 wrap around, compiled or not.
         """
         h = torch.tensor(value)
-        for _ in range(2):
-            h = (h ^ (h >> 32)) * self.mix
+        h = (h ^ (h >> 32)) * self.mix
+        h = (h ^ (h >> 32)) * self.mix
         return int(((h >> self.shift) & self.mask).item())
 
 
