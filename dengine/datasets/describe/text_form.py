@@ -24,7 +24,7 @@ from ..read.files import caught, natural_key
 from ..read.text import BLANK, COMMENT, LATIN, header_names, split_line, to_utf8, to_utf8_or_latin
 from ..table import pattern_of
 from ..units import is_unit
-from .clock import CLOCK_NAME, EVEN
+from .clock import EVEN
 from .columns import MOST_WORDS, NUMBER, Proposal, most_frequent
 
 DELIMITERS = ";\t|, "
@@ -182,12 +182,10 @@ def _head_lines(rows: Rows, width: int, stated: Stated) -> tuple[int, int]:
     A candidate for either is a line of at least `width` cells, the number of columns, of which one
     is neither empty nor a row of dashes. The header is the last candidate; but if more than half of
     its cells are units, and there is an earlier candidate, it is the line of the units, and the one
-    before it the header. Otherwise it is doubtful if the candidate before the last has nothing but
-    units; or if the last has a unit, or a name twice, and the one before no empty cell. Then the
-    last has comments if that candidate has nothing but units, and the line right above it is a
-    candidate that names a clock: these two are units and header. If not, DataError is raised. If
-    `stated`, the keys that the user gave, has `text.header`, there is no doubt (its value is not
-    used here).
+    before it the header. Raises DataError if several candidates may be the header: if the one
+    before the last has nothing but units; or if the last has a unit, or a name twice, and the one
+    before no empty cell. No error is raised if `stated`, the keys that the user gave, has
+    `text.header` (its value is not used here).
 
     rows : the cells of the lines above the samples.
     """
@@ -199,27 +197,19 @@ def _head_lines(rows: Rows, width: int, stated: Stated) -> tuple[int, int]:
     header, units = max(heads, default=0), 0
     if len(heads) > 1:
         above, last = (rows[i - 1] for i in heads[-2:])
-        if _share_of_units(last) > HALF:
+        names = [*filter(None, last)]
+        share = _share_of_units(names)
+        is_odd = share or len({*names}) < len(names)
+        if share > HALF:
             header, units = heads[-2:]
-        elif "text.header" not in stated and _is_doubtful(above, last):
-            has_comments = (
-                _share_of_units(above) == 1
-                and heads[-3:-2] == [heads[-2] - 1]
-                and any(map(CLOCK_NAME.search, rows[heads[-2] - 2]))
+        elif "text.header" not in stated and (
+            _share_of_units(above) == 1 or (is_odd and all(above))
+        ):
+            raise DataError(
+                f"Expected one line of names, lines {listed(heads)} may be; state text.header, and "
+                "text.units for a line of units."
             )
-            if not has_comments:
-                raise DataError(
-                    f"Expected one line of names, lines {listed(heads)} may be; state text.header."
-                )
-            header, units = heads[-3:-1]
     return header, units
-
-
-def _is_doubtful(above: Strings, last: Strings) -> bool:
-    """Return whether either of two lines of cells may be the header, see `_head_lines`."""
-    names = [*filter(None, last)]
-    is_odd = _share_of_units(last) > 0 or len({*names}) < len(names)
-    return _share_of_units(above) == 1 or (is_odd and all(above))
 
 
 def _share_of_units(row: Strings) -> float:
