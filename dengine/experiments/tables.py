@@ -108,15 +108,15 @@ def pool(frame: pd.DataFrame, replays: Sequence[Replay]) -> list[Row]:
     """
     rows = []
     for key, part in frame.reset_index(drop=True).groupby(CONDITION, sort=False):
-        totals = {name: int(part[name].sum()) for name in COUNTS}
+        totals = part[COUNTS].sum().to_dict()
         row = dict(zip(CONDITION, key, strict=True))
         row |= {"replays": len(part), "cycles": int(part["cycles"].sum())}
-        row |= {name: float(part[name].mean()) for name in COUNTS}
+        row |= part[COUNTS].mean().to_dict()
         row |= {f"total_{name}": total for name, total in totals.items()}
         row |= {f"{name}_sd": float(part[name].std()) for name in ("certain", "false_positive")}
         row["precision"] = share_right(totals["false_positive"], totals["accepted"])
         row["npv"] = share_right(totals["false_negative"], totals["rejected"])
-        row |= {name: float(part[name].agg(how)) for name, how in AGGREGATED.items()}
+        row |= part.agg(AGGREGATED).to_dict()
         row["retrains_dropped"] = int(part["retrains_dropped"].sum())
         error = pooled_error([replays[i] for i in part.index])
         row |= {"error_lower": error.lower, "error_upper": error.upper}
@@ -212,9 +212,7 @@ def table_of_numbers(
     for i, name in enumerate(rows[0]):
         table.add_column(name, justify="right" if i else "left", no_wrap=i > 0, overflow="fold")
     for i, row in enumerate(rows):
-        if total and i == len(rows) - 1:
-            table.add_section()
-        table.add_row(*map(escape, row.values()))
+        table.add_row(*map(escape, row.values()), end_section=total and i == len(rows) - 2)
     return table
 
 
