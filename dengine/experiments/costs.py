@@ -29,6 +29,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from scipy.stats import sem
 from scipy.stats import t as student
 
 from ..datasets import Dataset, load_dataset
@@ -831,7 +832,7 @@ def _policy_cost(policy: Policy, replays: Sequence[Replay], costs: Costs) -> Pol
     of_parts = np.array([part_costs(replay, costs) for replay in replays])  # (shuffles, cycles)
     cost = float(of_parts.mean())
     quantile = float(student.ppf(1.0 - ERROR_LEVEL / 2, len(replays) - 1))
-    luck = quantile * _order_error(of_parts.mean(1))
+    luck = quantile * float(sem(of_parts.mean(1)))
     return PolicyCost(
         policy=policy,
         expected_cost=cost_at(_expected_rate(bad), _expected_rate(good)),
@@ -858,11 +859,6 @@ def _expected_rate(error: ErrorRate) -> float:
     return (n_wrong + 0.5) / (error.traces + 1)
 
 
-def _order_error(means: Floats) -> float:
-    """Return the standard error of a mean over two or more shuffles, from the mean of each."""
-    return float(means.std(ddof=1)) / math.sqrt(len(means))
-
-
 def _difference(
     first: Sequence[Replay], other: Sequence[Replay], costs: Costs
 ) -> tuple[float, float]:
@@ -884,7 +880,7 @@ def _difference(
     parts = np.concatenate([replay.index for replay in first])
     sums = np.bincount(parts, (differences - mean).ravel())
     part_error = float(np.sqrt((sums**2).sum())) / differences.size
-    return mean, math.hypot(part_error, _order_error(differences.mean(1)))
+    return mean, math.hypot(part_error, sem(differences.mean(1)))
 
 
 def part_costs(replay: Replay, costs: Costs) -> Floats:
