@@ -329,28 +329,27 @@ def iterate_replays(
         for i, task in enumerate(tasks):
             kept = kept_replays.get(task)
             if kept is not None:
-                finished[i] = kept
-    yield from (PlayedReplay(i, kept, True) for i, kept in finished.items())
+                finished[i] = PlayedReplay(i, kept, True)
+    yield from finished.values()
     missing = [i for i in range(len(tasks)) if i not in finished]
     missing.sort(key=lambda i: tasks[i].seed)
     for name in sorted({tasks[i].contender.baseline or "" for i in missing} - {""}):
         baseline_class(name)
-    for i, played in Parallel(n_jobs=n_jobs, return_as="generator_unordered")(
+    for played in Parallel(n_jobs=n_jobs, return_as="generator_unordered")(
         delayed(_play)(data, i, tasks[i], on_cycle if n_jobs == 1 else None) for i in missing
     ):
         if kept_replays is not None:
-            kept_replays.put(tasks[i], played)
-        yield PlayedReplay(i, played, False)
+            kept_replays.put(tasks[played.position], played.replay)
+        yield played
 
 
-def _play(data: Dataset, i: int, task: Task, on_cycle: Any) -> tuple[int, Replay]:
+def _play(data: Dataset, i: int, task: Task, on_cycle: Any) -> PlayedReplay:
     """Play one task, a replay of the data set to be played, in this process or a joblib worker.
 
-    Returns `i`, the position of the task among all tasks, and the replay. `on_cycle` is called
-    after each cycle (one part) with the number of finished ones; None: nothing is called. Raises
-    what `replay` raises.
+    `i` is the position of the task among all tasks. `on_cycle` is called after each cycle (one
+    part) with the number of finished ones; None: nothing is called. Raises what `replay` raises.
     """
-    return i, replay(
+    played = replay(
         data,
         task.contender,
         task.seed,
@@ -358,6 +357,7 @@ def _play(data: Dataset, i: int, task: Task, on_cycle: Any) -> tuple[int, Replay
         shuffle=task.shuffle,
         on_cycle=on_cycle,
     )
+    return PlayedReplay(i, played, False)
 
 
 def run_grid(

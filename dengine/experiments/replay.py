@@ -568,19 +568,22 @@ def replay(
     """
     data = load_dataset(dataset)
     changes = without_none({"alpha": alpha, "lower_bound": lower_bound})
-    contender = None
+    n_cycles = len(data) if cycles is None else cycles
+    expect(1 <= n_cycles <= len(data), f"1 to {len(data)} cycles from {data.name}", n_cycles)
+    order = np.random.default_rng(seed).permutation(len(data)) if shuffle else np.arange(len(data))
+    order = order[:n_cycles]
     if not isinstance(recipe, DataEngine):
         contender = Contender.load(recipe).with_policy(**changes)
+        engine = contender.engine(seed, data.spec)
+        name = contender.name
     elif changes:
         raise SettingError(
             "Expected the policy of an engine on the engine, "
             f"got {' and '.join(changes)} beside an engine, which has its own; make it with them."
         )
-    n_cycles = len(data) if cycles is None else cycles
-    expect(1 <= n_cycles <= len(data), f"1 to {len(data)} cycles from {data.name}", n_cycles)
-    order = np.random.default_rng(seed).permutation(len(data)) if shuffle else np.arange(len(data))
-    order = order[:n_cycles]
-    engine: DataEngine = recipe if contender is None else contender.engine(seed, data.spec)
+    else:
+        engine = recipe
+        name = engine.recipe.name
 
     begin = time.perf_counter()
     report = None if on_cycle is None else lambda cycle: on_cycle(cycle.index + 1)
@@ -590,7 +593,7 @@ def replay(
         truth=run.truth.astype(np.bool_),
         index=order,
         confirm=confirm,
-        name=run.name if contender is None else contender.name,
+        name=name,
         dataset=data.name,
         seed=seed,
         seconds=time.perf_counter() - begin,
