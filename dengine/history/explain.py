@@ -208,9 +208,7 @@ def explain(store: SqlStore, decision_id: str, neighbours: int = 10) -> Explanat
     recipe = Recipe.from_store(settings)
     recipe = replace(recipe, policy=_find_policy(store, item.time, recipe.policy))
     channels, samples = item.trace.shape
-    version = None
-    if decision.model_version:
-        version = load_past_version(store, decision.model_version, recipe, item)
+    version = load_past_version(store, decision.model_version, recipe, item)
     circumstances = Circumstances(
         recipe=recipe,
         spec=stored_trace_spec(settings) or TraceSpec(samples=samples, channels=channels),

@@ -121,7 +121,7 @@ def part_map(store: "SqlStore", recipe: Recipe, version: int) -> PartMap:
                 decision.action,
             )
     references: list[Mark] = []
-    if version and (past := load_past_version(store, version, recipe, None)) is not None:
+    if (past := load_past_version(store, version, recipe, None)) is not None:
         parts = {item.decision.id: item.decision.part for item in recent}
         points = past.index.column("points")
         labels = past.index.column("labels")
