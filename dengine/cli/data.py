@@ -80,9 +80,11 @@ def data(
 
     if sample:
         write_sample(source.data)
+    force = context.params["force"]
     description = source.describe(propose=True)
     if description is not None and description.open_keys:
-        _print_open_keys(source, description, _save(source, description, save, context))
+        path = description.save(source.path, force) if save else None
+        _print_open_keys(source, description, path)
         context.exit(int(check))
     dataset = source.load(description)
     survey = survey_dataset(dataset)
@@ -94,7 +96,8 @@ def data(
             good=survey.good,
             bad=survey.bad,
         )
-        path = _save(source, replace(description, seen=seen), save, context)
+        if save:
+            path = replace(description, seen=seen).save(source.path, force)
         shown = description.to_toml()
     last_line = ""
     if path is not None:
@@ -169,18 +172,6 @@ def _survey_parts(dataset: "Dataset", survey: "Survey") -> Iterator[Any]:
     if survey.near_repeats > MANY_REPEATS:
         yield f"{survey.near_repeats} {REPEATS}. {REPEATS_MEANING}"
     yield tolerance_note(dataset, Policy().lower_bound)
-
-
-def _save(
-    source: DataChoice, description: "Description", save: bool, context: click.Context
-) -> Path | None:
-    """Write the description if `--save` asks for it, and return its path; else None.
-
-    It goes to `source.path`, and replaces another file there only with `--force`, which `context`
-    has. Raises OutputError for another file without `--force`, and if the file cannot be written.
-    Without `--save` nothing is written.
-    """
-    return description.save(source.path, context.params["force"]) if save else None
 
 
 def _trace_line(dataset: "Dataset", i: int) -> str:

@@ -205,13 +205,11 @@ def _history_table(items: Sequence[StoredDecision | StoredVersion | Event]) -> s
         texts.insert(1, "-" * width)
         columns.append([f"{text:{name[0]}{width}}" for text in texts])
     rows = ("  ".join(row).rstrip() for row in zip(*columns, strict=True))
-    lines = [next(rows), next(rows)]
-    for item in items:
-        if isinstance(item, StoredDecision):
-            lines.append(next(rows))
-        else:
-            lines.append(_event_line(item)[: TABLE_WIDTH - 1])
-    return "\n".join(lines)
+    lines = (
+        next(rows) if isinstance(item, StoredDecision) else _event_line(item)[: TABLE_WIDTH - 1]
+        for item in items
+    )
+    return "\n".join([next(rows), next(rows), *lines])
 
 
 def _event_line(item: StoredVersion | Event) -> str:
