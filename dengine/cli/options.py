@@ -545,7 +545,7 @@ class DataChoice:
             data = load_dataset(
                 self.data,
                 description,
-                channels=self.options.get("channel"),
+                channels=self.options.get("channels"),
                 samples=self.options.get("samples"),
                 progress=advance,
             )
@@ -580,10 +580,9 @@ CHOICE = {
         type=COUNT,
         help="Use only this many samples from the start of each trace, which decides earlier.",
     ),
-    "channel": click.option(
+    "channels": click.option(
         "--channels",
         "--channel",
-        "channel",
         type=CommaList(click.STRING),
         metavar="NAMES",
         help="FZ_Base, or several with commas between.  [default: those that are described]",
@@ -711,7 +710,7 @@ def recorder_settings(options: Options) -> tuple[Values, TraceSpec]:
 
     An `RtdeRecorder` records traces of a Universal Robots controller; a `TraceSpec` says what
     shape, rate and unit traces have. Both come from the values of `--samples`, `--channels`,
-    `--rate-hz`, `--unit` and `--fit` in `options`, under samples, channel, rate_hz, unit and fit,
+    `--rate-hz`, `--unit` and `--fit` in `options`, under samples, channels, rate_hz, unit and fit,
     as far as they were given; other options are ignored. The settings are samples, rate_hz and
     channels, and those that were not given are left out. The `TraceSpec` has the recorder's
     defaults for them (see `spec_of_recording`), and also the unit and the fit (what is done with
@@ -720,8 +719,8 @@ def recorder_settings(options: Options) -> tuple[Values, TraceSpec]:
     """
     from ..cells.ur.recorder import spec_of_recording
 
-    names = {"samples": "samples", "rate_hz": "rate_hz", "channel": "channels"}
-    settings = {name: options[option] for option, name in names.items() if option in options}
+    names = ("samples", "rate_hz", "channels")
+    settings = {name: options[name] for name in names if name in options}
     form = {name: options[name] for name in ("unit", "fit") if name in options}
     return settings, replace(spec_of_recording(**settings), **form)
 
@@ -753,13 +752,13 @@ def trace_spec_from(options: Options) -> TraceSpec | None:
     from ..records import TraceSpec
 
     settings = {name: options[name] for name in TRACE if name in options}
-    names = settings.pop("channel", ())
-    if not settings and not names:
+    if not settings:
         return None
     if "samples" not in settings:
         raise click.UsageError(
             "Live traces need --samples too; without these options the first trace sets all."
         )
+    names = settings.pop("channels", ())
     # `--channels 3` is a number of channels, not the name of one.
     if len(names) == 1 and names[0].isdecimal():
         return TraceSpec(**settings, channels=int(names[0]))

@@ -95,14 +95,18 @@ def _play(
     error: BaseException | None = None
     n_cycles = len(tasks) * (stream.cycles or len(dataset))
     with progress_bar(f"replaying {dataset.name}", n_cycles) as advance:
-        # A callback cannot travel to other processes: there the bar moves by whole replays.
-        on_cycle = (lambda cycle: advance(1)) if stream.n_jobs == 1 else None
         try:
             for item in iterate_replays(
-                dataset, tasks, n_jobs=stream.n_jobs, keep=stream.keep, on_cycle=on_cycle
+                dataset,
+                tasks,
+                n_jobs=stream.n_jobs,
+                keep=stream.keep,
+                on_cycle=lambda cycle: advance(1),
             ):
                 played.append(item)
-                advance(len(item.replay) if on_cycle is None or item.kept else 0)
+                # A callback cannot travel to other processes: there the bar moves by whole replays.
+                if stream.n_jobs != 1 or item.kept:
+                    advance(len(item.replay))
         except (KeyboardInterrupt, Exception) as interruption:  # what was finished is shown first
             error = interruption
     return sorted(played, key=lambda item: item.position), error

@@ -121,9 +121,7 @@ def load_past_version(
         ]
     before = store.labels.past(int(stored.state["trained_on"][0]) - 1, stored.last_seq)
     by_number = {label.seq: label for label in (*before, *later) if not label.quarantined}
-    index = _restore_index(
-        stored, [label for label in later if label.model_version == version], recipe
-    )
+    index = _restore_index(stored, later, recipe)
     return PastVersion(
         index=index,
         labels=[by_number.get(number) for number in index.column("numbers").tolist()],
@@ -133,22 +131,23 @@ def load_past_version(
     )
 
 
-def _restore_index(stored: ModelVersion, added: list[PastLabel], recipe: Recipe) -> RadiusIndex:
-    """Return the index of a stored version's references, with the labels `added` later.
+def _restore_index(stored: ModelVersion, later: list[PastLabel], recipe: Recipe) -> RadiusIndex:
+    """Return the index of a stored version's references, with the `later` labels of its decisions.
 
-    References are labelled points. A label without a point (the embedding of its trace) is left
-    out. The index counts as full if the version had replaced its oldest references for lack of
-    room; each added reference then replaces the oldest. Otherwise there is room for `recipe.window`
-    references, but at least for the stored ones, after which the oldest are replaced, too. A
-    reference lies in the embedding space of its fold, a group that follows from the label's
-    `content_hash`: the hash of the part's number, or of the trace if it has none.
+    References are labelled points. A label without a point (the embedding of its trace), or of
+    another version's decision, is left out. The index counts as full if the version had replaced
+    its oldest references for lack of room; each added reference then replaces the oldest. Otherwise
+    there is room for `recipe.window` references, but at least for the stored ones, after which the
+    oldest are replaced, too. A reference lies in the embedding space of its fold, a group that
+    follows from the label's `content_hash`: the hash of the part's number, or of the trace if it
+    has none.
     """
     n = stored.state["points"].shape[1]
     spaces = len(stored.state["scale"])
     is_full = int(stored.state["total"]) > n
     index = RadiusIndex.from_state(stored.state, n if is_full else max(n, recipe.window))
-    for label in added:
-        if label.point is not None:
+    for label in later:
+        if label.model_version == stored.version and label.point is not None:
             index.add_one(
                 torch.from_numpy(label.point),
                 float(label.success),
