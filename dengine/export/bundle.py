@@ -353,7 +353,7 @@ def read_checked(path: Path, key: FilePath | None = None) -> bytes:
         key has fewer than 16 bytes, or the content was not signed with this key.
     """
     content = _read(path)
-    expected = _first_word(_read(sibling_path(path, "sha256"), SUM_BYTES))
+    expected = _first_word(sibling_path(path, "sha256"))
     if not SHA256.fullmatch(expected):
         raise ExportError(
             f"{path}.sha256 holds no SHA-256 sum of {path.name}; copy it again together with "
@@ -373,7 +373,7 @@ def read_checked(path: Path, key: FilePath | None = None) -> bytes:
                 f"A key was given, and {path} is not signed: {file} is missing; export it anew "
                 "with it."
             )
-        if not hmac.compare_digest(_first_word(_read(file, SUM_BYTES)).encode(), signed.encode()):
+        if not hmac.compare_digest(_first_word(file).encode(), signed.encode()):
             raise ExportError(
                 f"{path} has no signature by the key in {key}: it was changed, or signed with "
                 "another one."
@@ -381,10 +381,12 @@ def read_checked(path: Path, key: FilePath | None = None) -> bytes:
     return content
 
 
-def _first_word(content: bytes) -> str:
-    """Return the text before the first space of a file's content, a sum or a signature; "" if it
-    begins with a space or is empty. Bytes that are not UTF-8 are replaced, and nothing is raised.
+def _first_word(path: Path) -> str:
+    """Return the text before the first space of a file, a sum or a signature; "" if it begins with
+    a space or is empty. Bytes that are not UTF-8 are replaced. Raises ExportError if the file is
+    missing or cannot be read.
     """
+    content = _read(path, SUM_BYTES)
     return content.decode("utf-8", errors="replace").partition(" ")[0].strip()
 
 

@@ -163,16 +163,15 @@ def read_journal(path: FilePath, spec: TraceSpec) -> CellJournal:
             kind, *words = content.decode().split(",")
             if kind == "part":
                 line = _parse_part(words, spec)
+                # Only when the next part comes is an accepted one of unknown outcome counted.
+                lines += filter(None, [pending])
+                pending = line if line.label is None else None
             else:
                 line = replace(parts[words[0]], label=LABELS[words[1]])
-        if kind == "part":
-            # Only when the next part comes is an accepted one of unknown outcome counted.
-            lines += filter(None, [pending])
-            pending = line if line.label is None else None
-        elif pending is not None and pending.decision.id == line.decision.id:
-            pending = None
-        else:
-            line = replace(line, late=True)
+                if pending is not None and pending.decision.id == line.decision.id:
+                    pending = None
+                else:
+                    line = replace(line, late=True)
         parts[line.decision.id] = line
         if line.label is not None:
             lines.append(line)

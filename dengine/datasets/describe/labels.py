@@ -7,7 +7,7 @@ that it holds a verdict. Any other place with few words is a candidate, if nothi
 
 import re
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from itertools import permutations
@@ -144,7 +144,7 @@ def is_named_like_verdict(source: LabelSource) -> bool:
     return is_named and (not source.path or lists_words(source))
 
 
-def may_be_labels(source: LabelSource, words: Names) -> bool:
+def may_be_labels(source: LabelSource, words: Collection[str]) -> bool:
     """Return whether a source may hold labels, because it has few different words.
 
     `words` has the word of each recording, or of each row of a listing. There must be 2 to 12
@@ -152,7 +152,6 @@ def may_be_labels(source: LabelSource, words: Names) -> bool:
     verdict (`is_named_like_verdict`), the average does not matter, and one word is enough if it is
     known to mean good or bad, or if the source states words for good or bad.
     """
-    words = [*words]
     n = len({*words})
     if not is_named_like_verdict(source):
         return 2 <= n <= min(len(words) / 2, MOST_WORDS)
@@ -300,10 +299,8 @@ def unmatched(p: Proposal, counted: Iterable[LabelSource]) -> Iterator[str]:
     `counted` are the sources of labels for recordings of `p`; a listing that has a word for half of
     them or fewer is not among these, also if its rows with one key have different words. A listing
     is a file with a row for each recording or part, and its verdict a column that is named like
-    one. If the user stated a source, nothing is yielded. Raises what `sources_of` raises.
+    one. Raises what `sources_of` raises.
     """
-    if place_of(p.description.label):
-        return
     listings = {source.listing for source in counted}
     for source in sources_of(p, ()):
         if source.listing and source.listing not in listings and is_named_like_verdict(source):
@@ -403,7 +400,7 @@ def propose_label(p: Proposal) -> None:
     counted = count_sources(p, stated)
     named = [*counted] if stated else [*filter(is_named_like_verdict, counted)]
     certain = [s for s in named if is_known(s, counted[s]) and UNKNOWN not in s.good + s.bad]
-    strays = [*unmatched(p, counted)]
+    strays = [] if stated else [*unmatched(p, counted)]
     doubt = doubt_on(certain[0], counted, strays) if certain else doubt_among(named, counted)
     if doubt:
         p.put(

@@ -5,7 +5,6 @@ import re
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
-from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -87,8 +86,12 @@ def match_files(root: Path, patterns: Strings) -> set[str]:
     with instead(
         DataError, f"Expected patterns below a folder in files and exclude, got {patterns}", *BAD
     ):
-        files = chain(*(root.glob(f"{p}/*" if p.endswith("**") else p) for p in patterns))
-        return {path.relative_to(root).as_posix() for path in files if path.is_file()}
+        return {
+            path.relative_to(root).as_posix()
+            for pattern in patterns
+            for path in root.glob(f"{pattern}/*" if pattern.endswith("**") else pattern)
+            if path.is_file()
+        }
 
 
 def find_files(root: Path, description: Description) -> list[str]:

@@ -232,21 +232,17 @@ def read_recordings(
         read_labels(label, lambda name: listing_table(base / name, description.text))
         for label in description.labels
     ]
-    recordings = list[Recording]()
-    n_unlabelled = 0
+    parts = list[Recording | None]()  # None: without a label
     for file in files:
         with caught(faults, file.source if isinstance(file, Table) else file):
             for part in parts_of(file, description, base):
                 with caught(faults, part.source):
-                    recording = recording_of(part, description, labels)
-                    if recording is None:
-                        n_unlabelled += 1
-                    else:
-                        recordings.append(recording)
+                    parts.append(recording_of(part, description, labels))
         if progress is not None:
             progress(1)
-    recordings.sort(key=lambda item: item.rank)
-    recordings, repeats = without_repeats(recordings)
+    n_unlabelled = parts.count(None)
+    labelled = sorted(filter(None, parts), key=lambda recording: recording.rank)
+    recordings, repeats = without_repeats(labelled)
     faults += repeats
     if not recordings:
         raise DataError(
@@ -319,11 +315,11 @@ def is_dropped(part: Table, rows: RowMeanings) -> bool:
     example a row with the samples of another signal, in a table with a row for each part. A column
     that the part lacks, or a word without a meaning, drops nothing.
     """
-    for name in rows.keys() & part.columns.keys():
-        cells = part.columns[name]
-        if len(cells) == 1 and rows[name].kinds([as_word(cells[0])]) == ["drop"]:
-            return True
-    return False
+    return any(
+        len(cells) == 1 and rows[name].kinds(map(as_word, cells)) == ["drop"]
+        for name, cells in part.columns.items()
+        if name in rows
+    )
 
 
 def dataset_of(recordings: Sequence[Recording], description: Description) -> Dataset:
