@@ -261,10 +261,9 @@ class OnnxDecision(nn.Module):
         super().__init__()
         model = source.model
         index = model.index
-        limit = source.trace.limit
         self.rule: DecisionRule = model.rule
         self.radius = float(model.classifier.radius)
-        self.limit = float("inf") if limit is None else limit
+        self.limit = source.trace.limit or float("inf")
         self.encoder = model.spaces.module()
         self.novelty = model.gate
         self.register_buffer("scale", torch.from_numpy(model.scale)[:, None])

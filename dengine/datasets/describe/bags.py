@@ -49,7 +49,8 @@ def propose_bag(p: Proposal) -> None:
     that reads bags is missing, or if a setting in `[time]` is wrong; a later damage only ends the
     reading. Raises SettingError for a malformed `windows.trigger`, unless channels are stated.
     """
-    times, words = defaultdict[str, list[int]](list), defaultdict[str, list[str]](list)
+    times = defaultdict[str, list[int]](list)
+    words = defaultdict[str, list[str]](list)
     units = dict[str, str]()
     is_stamped = True
     messages = read_messages(p.base / p.names[0], None)

@@ -158,7 +158,8 @@ def parts_of(p: Proposal, files: Tables) -> list[Table]:
     `part.column`, if none is stated, or if their cells are lists; and UnreadableError if the
     columns like `x0`, `x1` of one channel differ in length.
     """
-    description, layout = p.description, p.description.layout
+    description = p.description
+    layout = description.layout
     patterns = numbered_columns(files[0])
     if layout == "columns":
         patterns = [ANY]

@@ -12,7 +12,7 @@ from dataclasses import asdict, replace
 from functools import partial
 from itertools import chain, product
 from operator import itemgetter
-from statistics import mode
+from statistics import fmean, mode
 from typing import NamedTuple
 
 import numpy as np
@@ -194,7 +194,8 @@ def _head_lines(rows: Rows, width: int, stated: Stated) -> tuple[int, int]:
         for i, row in enumerate(rows, 1)
         if len(row) >= width and not all(map(RULE.fullmatch, row))
     ]
-    header, units = max(heads, default=0), 0
+    header = max(heads, default=0)
+    units = 0
     if len(heads) > 1:
         above, last = (rows[i - 1] for i in heads[-2:])
         names = [*filter(None, last)]
@@ -214,8 +215,7 @@ def _head_lines(rows: Rows, width: int, stated: Stated) -> tuple[int, int]:
 
 def _share_of_units(row: Strings) -> float:
     """Return the share of units among the cells that are not empty, of which one is needed."""
-    words = [*filter(None, row)]
-    return sum(is_unit(word) or bool(UNIT_WORDS.fullmatch(word)) for word in words) / len(words)
+    return fmean(is_unit(word) or bool(UNIT_WORDS.fullmatch(word)) for word in row if word)
 
 
 def propose_form(p: Proposal, contents: Mapping[str, bytes], faults: Faults) -> Strings:
