@@ -216,8 +216,9 @@ class LabelSource:
     @property
     def meanings(self) -> dict[str, int | None]:
         """What each word means: 1 good, 0 bad, None not checked; of several, the first of these."""
-        checked = dict.fromkeys(self.bad, 0) | dict.fromkeys(self.good, 1)
-        return dict.fromkeys(self.unchecked) | checked
+        return (
+            dict.fromkeys(self.unchecked) | dict.fromkeys(self.bad, 0) | dict.fromkeys(self.good, 1)
+        )
 
 
 @dataclass(frozen=True, slots=True)

@@ -329,17 +329,6 @@ LINE = {  # attributes of `CellService`
     "check_seconds": _described(float, "Duration of a verification."),
 }
 Traces: Any = list[list[float | None]]
-BAND = {
-    "trace": _described(Traces, "Shape (channels, samples)."),
-    "low": _described(Traces | None, "Lower edge of the band of good parts; null without one."),
-    "median": _described(Traces | None, "Median of the good parts; null without a band."),
-    "high": _described(Traces | None, "Upper edge of the band; null without one."),
-    "bads": _described(list[Traces], "The newest bad parts' traces."),
-}
-LISTS: dict[type, Any] = {
-    record: list[_json_type(record)]  # type: ignore[misc]  # made here
-    for record in (Correction, Event, StoredVersion)
-}
 DecisionResponse: Any = _response_type(
     "Decision",
     "A decision with its label.",
@@ -371,8 +360,14 @@ RESPONSES = {
             "Explanation",
             "Why a decision came out as it did.",
             Explanation,
-            **BAND,
-            corrections=_described(LISTS[Correction], "Of the label, oldest first."),
+            trace=_described(Traces, "Shape (channels, samples)."),
+            low=_described(
+                Traces | None, "Lower edge of the band of good parts; null without one."
+            ),
+            median=_described(Traces | None, "Median of the good parts; null without a band."),
+            high=_described(Traces | None, "Upper edge of the band; null without one."),
+            bads=_described(list[Traces], "The newest bad parts' traces."),
+            corrections=_described(_json_type(list[Correction]), "Of the label, oldest first."),
         ),
         _response_type(
             "Status",
@@ -385,8 +380,8 @@ RESPONSES = {
         ),
         _response_type("Course", "", Course),
         _response_type("PartMap", "", PartMap),
-        _response_type("Events", "Newest first.", events=LISTS[Event]),
-        _response_type("Versions", "Oldest first.", versions=LISTS[StoredVersion]),
+        _response_type("Events", "Newest first.", events=_json_type(list[Event])),
+        _response_type("Versions", "Oldest first.", versions=_json_type(list[StoredVersion])),
         Health,
         Me,
         Problem,

@@ -173,12 +173,15 @@ class Conditions:
 
 # Fields of `Conditions` that are drawn by a setting of another name, or in a fixed range.
 _DRAWN_BY: dict[str, str | Range] = {
-    **dict.fromkeys(("offset_x_mm", "offset_y_mm"), "offset_sd_mm"),
-    **dict.fromkeys(("tilt_x_deg", "tilt_y_deg"), "tilt_sd_deg"),
+    "offset_x_mm": "offset_sd_mm",
+    "offset_y_mm": "offset_sd_mm",
+    "tilt_x_deg": "tilt_sd_deg",
+    "tilt_y_deg": "tilt_sd_deg",
     "yaw_deg": "yaw_sd_deg",
     "protrusion_mm": "protrusion_sd_mm",
     "extra_length_mm": "length_sd_mm",
-    **dict.fromkeys(("debris_x_mm", "debris_y_mm"), (-5.0, 5.0)),
+    "debris_x_mm": (-5.0, 5.0),
+    "debris_y_mm": (-5.0, 5.0),
     "debris_softness_s": (0.003, 0.02),
 }
 

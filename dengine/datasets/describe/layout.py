@@ -159,9 +159,8 @@ def parts_of(p: Proposal, files: Tables) -> list[Table]:
     columns like `x0`, `x1` of one channel differ in length.
     """
     description = p.description
-    layout = description.layout
     patterns = numbered_columns(files[0])
-    if layout == "columns":
+    if description.layout == "columns":
         patterns = [ANY]
         clock = [*description.time.column, *filter(CLOCK_NAME.search, files[0].columns)]
         description = description.with_values({"time.column": clock})
@@ -170,6 +169,6 @@ def parts_of(p: Proposal, files: Tables) -> list[Table]:
     parts = list[Table]()
     for table in files:
         of_file = [*split(table, description)]
-        is_cut = p.is_cut and layout == "long" and len(of_file) > 1
+        is_cut = p.is_cut and description.layout == "long" and len(of_file) > 1
         parts += of_file[: len(of_file) - is_cut]
     return parts

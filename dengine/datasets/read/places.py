@@ -19,7 +19,7 @@ from .frames import read_parquet
 from .text import read_text, to_utf8_or_latin
 
 ListingReader = Callable[[str], Table]  # returns the table of the listing of a name
-DELIMITERS = (",", ";", "\t", "|")
+DELIMITERS = ",;\t|"
 MARKS = " \t;,:：=\"'"  # around the words of a line
 
 

@@ -338,18 +338,17 @@ def dataset_of(recordings: Sequence[Recording], description: Description) -> Dat
         for key in ("trace", "label", "part", "source", "length")
     )
     channels = [*description.channels.values()]
-    clock = description.time
     fit = description.traces.lengths.removesuffix("-all")
     return make_dataset(
         X,
         labels,
-        rate_hz=clock.rate_hz or None,
+        rate_hz=description.time.rate_hz or None,
         unit=unit_text([channel.unit for channel in channels]),
         limit=channels[0].limit or None,
         part=parts if parts.any() else None,
         channels=tuple(description.channels),
         source=sources,
-        fit="strict" if fit == "resample" and clock.column else fit,
+        fit="strict" if fit == "resample" and description.time.column else fit,
         lengths=lengths,
         ordered=np.count_nonzero(np.diff(labels)) != 1,
     )
