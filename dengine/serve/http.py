@@ -340,8 +340,9 @@ class HttpApi:
         """
         status = await self.service.status(watch)
         line = {name: getattr(self.service, name) for name in api.LINE}
-        claim = status.certificate.sentence
-        return response_fields("Status", status, alarm=status.alarm, claim=claim, **line)
+        return response_fields(
+            "Status", status, alarm=status.alarm, claim=status.certificate.sentence, **line
+        )
 
     async def decision(self, id_: Id) -> StoredDecision:
         """Return one decision with its label; 404 for an unknown id, 422 for an invalid one, 503 if

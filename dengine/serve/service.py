@@ -257,10 +257,9 @@ class CellService:
             )
             decision = await asyncio.wrap_future(recording)
             self.late += 1
-        response = ServiceResponse(
-            decision, decision.reason is Reason.LATE, time.monotonic() - begin
+        return self._notify_observers(
+            ServiceResponse(decision, decision.reason is Reason.LATE, time.monotonic() - begin)
         )
-        return self._notify_observers(response)
 
     async def report(self, decision_id: str, success: float, author: str = "") -> ReportResponse:
         """Report the outcome of a decision; the label is on disk when this returns.
@@ -339,8 +338,9 @@ class CellService:
             return False, retrain
 
         repeated, retrain = await self.call(work)
-        response = ReportResponse(decision_id, label, repeated, retrain, time.monotonic() - begin)
-        return self._notify_observers(response)
+        return self._notify_observers(
+            ReportResponse(decision_id, label, repeated, retrain, time.monotonic() - begin)
+        )
 
     async def find(self, decision_id: str) -> StoredDecision | None:
         """Return a decision with its trace and label, after waiting for the engine's thread.

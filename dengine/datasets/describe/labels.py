@@ -299,8 +299,10 @@ def unmatched(p: Proposal, counted: Iterable[LabelSource]) -> Iterator[str]:
     `counted` are the sources of labels for recordings of `p`; a listing that has a word for half of
     them or fewer is not among these, also if its rows with one key have different words. A listing
     is a file with a row for each recording or part, and its verdict a column that is named like
-    one. Raises what `sources_of` raises.
+    one. If the user stated a source, nothing is yielded. Raises what `sources_of` raises.
     """
+    if place_of(p.description.label):
+        return
     listings = {source.listing for source in counted}
     for source in sources_of(p, ()):
         if source.listing and source.listing not in listings and is_named_like_verdict(source):
@@ -400,7 +402,7 @@ def propose_label(p: Proposal) -> None:
     counted = count_sources(p, stated)
     named = [*counted] if stated else [*filter(is_named_like_verdict, counted)]
     certain = [s for s in named if is_known(s, counted[s]) and UNKNOWN not in s.good + s.bad]
-    strays = [] if stated else [*unmatched(p, counted)]
+    strays = [*unmatched(p, counted)]
     doubt = doubt_on(certain[0], counted, strays) if certain else doubt_among(named, counted)
     if doubt:
         p.put(
