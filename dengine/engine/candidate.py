@@ -14,10 +14,10 @@ from dataclasses import replace
 
 from ..decision.scripting import reason_of
 from ..errors import log
-from ..model.base import EngineModel
 from ..records import RetrainReport
 from ..store.records import Clock
 from .guard import NO_REFERENCE, guarded
+from .live_model import LiveModel
 from .trainer import Trained, TrainedOn, TrainingWindow
 
 
@@ -27,12 +27,10 @@ class Candidate:
     Parameters
     ----------
     trained : Trained
-    previous : EngineModel
-        The model that decides meanwhile; the candidate takes over its rule.
-    version : int
-        Number of the version in force, for the report of a training that was dropped.
-    corrected_to : int
-        Number of the newest correction that the labels of the training had.
+    live : LiveModel
+        Decides meanwhile, and the candidate takes over the rule that it has now. The report of a
+        training that was dropped has the number of its version. The labels of the training had the
+        same corrections as its references.
     clock : callable
         Seconds, of any origin.
 
@@ -47,22 +45,15 @@ class Candidate:
         Whether the version, or the report of a dropped one, is in the store.
     """
 
-    def __init__(
-        self,
-        trained: Trained,
-        previous: EngineModel,
-        version: int,
-        corrected_to: int,
-        clock: Clock,
-    ) -> None:
+    def __init__(self, trained: Trained, live: LiveModel, clock: Clock) -> None:
         self.model = trained.model
         self.report = RetrainReport(
-            version, 0.0, len(trained.seq), trained.n_steps, False, trained.reason
+            live.version, 0.0, len(trained.seq), trained.n_steps, False, trained.reason
         )
         self._learned_to = int(trained.seq[-1]) if len(trained.seq) else 0
-        self.trained_on = TrainedOn(trained.seq, corrected_to, self._learned_to)
+        self.trained_on = TrainedOn(trained.seq, live.corrected_to, self._learned_to)
         self.is_stored = False
-        self._previous = previous
+        self._previous = live.newest
         self._clock = clock
         self._begin = trained.begin  # of the retrain, put off by the time that is no work on it
         self._work_ended = clock()

@@ -16,7 +16,6 @@ from ..decision.members import SAFE_MODES
 from ..decision.policy import Policy
 from ..errors import ReportError, capitalized, expect, listed
 from ..records import as_success, is_whole
-from ..store.outbox import Outbox
 from ..store.records import (
     LABEL_TEXTS,
     POLICY_CHANGED,
@@ -26,9 +25,7 @@ from ..store.records import (
     unknown_decision,
 )
 from ..traces import check_rate
-from .feedback import Feedback
 from .learner import Learner
-from .live_model import LiveModel
 from .settings import BASELINE_SETTINGS, EvidenceWindow, SettingsInForce, refuse_idle
 
 # Settings of a policy that make its rule, or that its evidence is measured by.
@@ -70,27 +67,17 @@ class Corrections:
 
     Parameters
     ----------
-    outbox : Outbox
     settings : SettingsInForce
-    live : LiveModel
     learner : Learner
-    feedback : Feedback
     """
 
-    def __init__(
-        self,
-        outbox: Outbox,
-        settings: SettingsInForce,
-        live: LiveModel,
-        learner: Learner,
-        feedback: Feedback,
-    ) -> None:
-        self._outbox = outbox
-        self._store = outbox.store
+    def __init__(self, settings: SettingsInForce, learner: Learner) -> None:
         self._settings = settings
-        self._live = live
         self._learner = learner
-        self._feedback = feedback
+        self._live = learner.live
+        self._feedback = learner.feedback
+        self._outbox = learner.live.outbox
+        self._store = self._outbox.store
 
     def correct(self, decision_id: str, success: bool, author: str = "") -> Changed:
         """Correct a wrong label, or let a forgotten one count again, from the next decision on.

@@ -19,7 +19,6 @@ from numpy.typing import ArrayLike
 from ..decision.decider import DecisionConditions, Verdict, decider_without_model
 from ..errors import NotTakenError, StoreError, TraceConflictError, TraceError, expect, log
 from ..folds import part_hash
-from ..model.base import EngineModel
 from ..records import (
     ACTIONS,
     LONGEST,
@@ -33,7 +32,6 @@ from ..records import (
     is_name,
     is_whole,
 )
-from ..store.outbox import Outbox
 from ..store.records import StoredDecision
 from ..traces import as_trace, infer_trace_spec
 from .guard import NOT_PRECOMPUTED, guarded
@@ -49,16 +47,13 @@ class DecisionMaker:
     settings : SettingsInForce
         Read at each decision; the first trace without a fault sets the `TraceSpec` in them.
     live : LiveModel
-        Holds the model that decides.
-    outbox : Outbox
-        Takes the decisions.
-
+        Holds the model that decides; its outbox takes the decisions.
     """
 
-    def __init__(self, settings: SettingsInForce, live: LiveModel, outbox: Outbox) -> None:
+    def __init__(self, settings: SettingsInForce, live: LiveModel) -> None:
         self._settings = settings
         self._live = live
-        self._outbox = outbox
+        self._outbox = live.outbox
         self._has_seen_trace = False  # a finite one, since the engine was made or opened
         self._run = uuid.uuid4().hex[:12]
         self._count = count(1)
@@ -192,9 +187,7 @@ class DecisionMaker:
         """
         if self._outbox.verify_all_reason:
             verify_reason = Reason.NO_STORE
-        return self._outbox.record_decision(
-            self._decide(x, part, self._live.answering, verify_reason, decision_id)
-        )
+        return self._outbox.record_decision(self._decide(x, part, verify_reason, decision_id))
 
     def sync(self, stored: StoredDecision) -> StoredDecision:
         """Wait until a decision and all earlier records are on disk; return the valid decision.
@@ -213,7 +206,7 @@ class DecisionMaker:
             # have two answers.
             if decision.action is not Action.VERIFY:
                 return self._outbox.replace_decision(
-                    self._decide(stored.trace, decision.part, None, Reason.NO_STORE, decision.id)
+                    self._decide(stored.trace, decision.part, Reason.NO_STORE, decision.id)
                 )
         return stored
 
@@ -250,17 +243,16 @@ class DecisionMaker:
         self,
         x: TraceArray,
         part: str | None,
-        model: EngineModel | None,
         verify_reason: Reason | None,
         decision_id: str | None,
     ) -> StoredDecision:
-        """Decide on one trace by a model; return the decision as a record that is not stored yet.
+        """Decide on one trace; return the decision as a record that is not stored yet.
 
         A trace with a fault, like a NaN, is verified for that reason, and its record is
         quarantined: it is never trained on. Otherwise, with a `verify_reason` the decision is
         VERIFY for this reason, and the force limits (an operator's limits of the signal) are not
         checked. Without it a trace outside a force limit is verified or rejected, as the limit
-        says, also without a model, and if the model raises. Else, without a model the decision is
+        says, also without a model in force, and if it raises. Else, without a model the decision is
         VERIFY, `Reason.NO_MODEL`. If the model raises, or returns bounds that are not 0 <= lower <=
         upper <= 1, that is logged, and the decision is VERIFY, `Reason.MODEL_ERROR`. Without a
         `decision_id` it gets a new id.
@@ -275,6 +267,7 @@ class DecisionMaker:
         conditions = self._settings.conditions or DecisionConditions(
             TraceSpec(samples=x.shape[1], channels=x.shape[0])
         )
+        model = self._live.answering
         if verify_reason is not None:
             verdict = _verify(x, replace(conditions, force_limits=()), verify_reason)
         elif model is None:

@@ -244,23 +244,24 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         self._exclusive = ExclusiveUse()
         self._outbox = open_outbox(store, recipe.window, reading=reading, patient=replaying)
         self._settings = SettingsInForce(settings, self._outbox)
-        window = TrainingWindow(recipe.window)
-        self._live = LiveModel(template, window, self._outbox, settings.evidence)
+        self._live = LiveModel(
+            template, TrainingWindow(recipe.window), self._outbox, settings.evidence
+        )
         peers = None
         if store.product is not None:
-            peers = Peers(self._outbox, self._live, window, clock)
-        self._feedback = Feedback(self._outbox, self._live, window, self._settings, on_safe_mode)
+            peers = Peers(self._live, clock)
+        self._feedback = Feedback(self._live, self._settings, on_safe_mode)
         retrainer = Retrainer(
-            window, None if replaying else recipe.budget, recipe.max_steps, executor, clock
+            self._live.window,
+            None if replaying else recipe.budget,
+            recipe.max_steps,
+            executor,
+            clock,
         )
-        self._learner = Learner(
-            self._outbox, self._live, window, self._feedback, peers, retrainer, clock
-        )
-        self._maker = DecisionMaker(self._settings, self._live, self._outbox)
-        self._corrections = Corrections(
-            self._outbox, self._settings, self._live, self._learner, self._feedback
-        )
-        self.state = EngineState(self._live, self._learner, self._outbox)
+        self._learner = Learner(self._live, self._feedback, peers, retrainer)
+        self._maker = DecisionMaker(self._settings, self._live)
+        self._corrections = Corrections(self._settings, self._learner)
+        self.state = EngineState(self._learner)
         weakref.finalize(self, _close_forgotten, self._outbox)
 
     def _resume(self) -> None:

@@ -14,7 +14,6 @@ from enum import Enum
 
 from ..errors import log
 from ..records import Action, Source, source_of
-from ..store.outbox import Outbox
 from ..store.records import (
     LATE_STOP,
     SAFE_MODE_BEGAN,
@@ -25,7 +24,6 @@ from ..store.records import (
 )
 from .live_model import LiveModel
 from .settings import SettingsInForce
-from .trainer import TrainingWindow
 
 # Called with the reason when a safe mode begins, and with "" when it ends.
 SafeModeListener = Callable[[str], object] | None
@@ -43,13 +41,10 @@ class Feedback:
 
     Parameters
     ----------
-    outbox : Outbox
-        Takes the labels.
     live : LiveModel
-        Learns from them.
-    window : TrainingWindow
-        Takes each label that is recorded; in a product, whose robot cells share labels,
-        `fleet.Peers` reads them from the store instead.
+        Learns from the labels, and its outbox takes them. Its window takes each label that is
+        recorded; in a product, whose robot cells share labels, `fleet.Peers` reads them from the
+        store instead.
     settings : SettingsInForce
         Whether an accepted part without a report is confirmed by the next decision, and since which
         version.
@@ -69,16 +64,11 @@ class Feedback:
     """
 
     def __init__(
-        self,
-        outbox: Outbox,
-        live: LiveModel,
-        window: TrainingWindow,
-        settings: SettingsInForce,
-        on_safe_mode: SafeModeListener,
+        self, live: LiveModel, settings: SettingsInForce, on_safe_mode: SafeModeListener
     ) -> None:
-        self._outbox = outbox
+        self._outbox = live.outbox
         self._live = live
-        self._window = window
+        self._window = live.window
         self._settings = settings
         self._on_safe_mode = on_safe_mode
         self.new_labels = 0

@@ -13,12 +13,11 @@ from __future__ import annotations
 import numpy as np
 
 from ..errors import StoreError, VersionError, log
-from ..store.outbox import Outbox
 from ..store.records import Clock
 from .guard import NOT_READY, guarded
 from .live_model import LiveModel
 from .resume import ChangedTracesError, add_labels_since, restore_model
-from .trainer import TrainedOn, TrainingWindow
+from .trainer import TrainedOn
 
 LOOK_SECONDS = 1.0  # between two looks for a newer version
 
@@ -28,21 +27,16 @@ class Peers:
 
     Parameters
     ----------
-    outbox : Outbox
     live : LiveModel
-        Gives way to a peer's newer version.
-    window : TrainingWindow
-        Takes the labels of all cells.
+        Gives way to a peer's newer version; its window takes the labels of all cells.
     clock : callable
         Seconds, of any origin.
     """
 
-    def __init__(
-        self, outbox: Outbox, live: LiveModel, window: TrainingWindow, clock: Clock
-    ) -> None:
-        self._outbox = outbox
+    def __init__(self, live: LiveModel, clock: Clock) -> None:
+        self._outbox = live.outbox
         self._live = live
-        self._window = window
+        self._window = live.window
         self._clock = clock
         self._looked = -np.inf  # when the store was last asked, by the clock
         self._is_lost = False  # the store gave no answer when it was last asked

@@ -22,8 +22,7 @@ from ..decision.policy import Policy
 from ..errors import StoreError, log
 from ..model.base import EngineModel
 from ..records import RetrainReport
-from ..store.outbox import Outbox
-from ..store.records import Change, Clock
+from ..store.records import Change
 from .candidate import Candidate
 from .feedback import Feedback, Remedy
 from .fleet import Peers
@@ -31,7 +30,7 @@ from .guard import NOT_PRECOMPUTED, NOT_READY, guarded
 from .live_model import LiveModel
 from .resume import add_labels_since, find_clean_start, restore_model
 from .settings import EvidenceWindow
-from .trainer import Retrainer, Trained, TrainedOn, TrainingWindow
+from .trainer import Retrainer, Trained, TrainedOn
 
 # So many labels without any retrain were imported, and the first training is worth preparing.
 IMPORTED = 500
@@ -48,15 +47,12 @@ class Learner:
 
     Parameters
     ----------
-    outbox : Outbox
     live : LiveModel
-    window : TrainingWindow
     feedback : Feedback
     peers : Peers or None
         None if the robot cell shares no product.
     retrainer : Retrainer
-    clock : callable
-        Seconds, of any origin, by which retrains are timed.
+        Its clock times the retrains.
 
     Attributes
     ----------
@@ -65,24 +61,18 @@ class Learner:
     """
 
     def __init__(
-        self,
-        outbox: Outbox,
-        live: LiveModel,
-        window: TrainingWindow,
-        feedback: Feedback,
-        peers: Peers | None,
-        retrainer: Retrainer,
-        clock: Clock,
+        self, live: LiveModel, feedback: Feedback, peers: Peers | None, retrainer: Retrainer
     ) -> None:
         self.live = live
         self.feedback = feedback
         self.dropped: list[str] = []
-        self._outbox = outbox
-        self._store = outbox.store  # called without a time limit, so never while the cell waits
-        self._window = window
+        self._outbox = live.outbox
+        # Called without a time limit, so never while the cell waits.
+        self._store = live.outbox.store
+        self._window = live.window
         self._peers = peers
         self._retrainer = retrainer
-        self._clock = clock
+        self._clock = retrainer.clock
         self._candidate: Candidate | None = None
         self._steps: Steps = iter(())  # of the candidate
         self._report: RetrainReport | None = None  # of the newest retrain, until it is taken
@@ -388,10 +378,7 @@ class Learner:
         note = self._start[2] if self._start is not None else ""
         if note:
             trained = replace(trained, reason=f"{trained.reason}; {note}")
-        live = self.live
-        self._candidate = Candidate(
-            trained, live.newest, live.version, live.corrected_to, self._clock
-        )
+        self._candidate = Candidate(trained, self.live, self._clock)
         self._steps = self._see_through(self._candidate)
         return self._candidate
 

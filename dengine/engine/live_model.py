@@ -39,7 +39,9 @@ class LiveModel:
     template : EngineModel
         Untrained; the first version is trained from it, and its rule is updated until then.
     window : TrainingWindow
+        Of the labels that the next version is trained on.
     outbox : Outbox
+        Through which the engine uses its store.
     evidence : EvidenceWindow
         Which decisions the rule in force is updated with.
 
@@ -174,9 +176,7 @@ class LiveModel:
         self.overdue_to = past.overdue_to
         if version is None or model is None:
             self._start_rule(self._read_outcomes(0))
-            self.corrected_to = max(
-                (correction.number for correction in store.corrections.after()), default=0
-            )
+            self.corrected_to = store.corrections.newest_number()
             return
         self.swap_in(model, version.version, trained_on)
         guarded(NOT_READY, model.prepare, self.template)

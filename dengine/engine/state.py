@@ -3,9 +3,7 @@
 from dataclasses import replace
 
 from ..history.status import Status, retrain_fault
-from ..store.outbox import Outbox
 from .learner import Learner
-from .live_model import LiveModel
 
 
 class EngineState:
@@ -13,15 +11,13 @@ class EngineState:
 
     Parameters
     ----------
-    live : LiveModel
     learner : Learner
-    outbox : Outbox
     """
 
-    def __init__(self, live: LiveModel, learner: Learner, outbox: Outbox) -> None:
-        self._live = live
+    def __init__(self, learner: Learner) -> None:
+        self._live = learner.live
         self._learner = learner
-        self._outbox = outbox
+        self._outbox = learner.live.outbox
 
     @property
     def new_labels(self) -> int:
