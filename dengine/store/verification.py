@@ -190,21 +190,23 @@ def verify_history(
             f"Expected a digest of 64 hexadecimal digits, or its first 8 or more, got {expect!r}."
         )
     with reading(str(url)) as connection:
-        names = _selected_cells(connection, cell_id)
         journals = {
-            name: _inspect_journal(journal_path(connection.engine.url, name)) for name in names
+            name: _inspect_journal(journal_path(connection.engine.url, name))
+            for name in _selected_cells(connection, cell_id)
         }
     with reading(str(url)) as connection:  # a later snapshot: it has what the journals knew
         pages = run_integrity_check(connection) if connection.dialect.name == "sqlite" else []
         faults = [HistoryFault("", "file", "", finding) for finding in pages]
-        checks = [CellCheck(connection, name, on_rows) for name in names]
-        for check in checks:
-            check_key(connection, check.cell_id, check.key)
-            entries, _, loss = journals[check.cell_id]
+        cells = []
+        digests: list[str] = []
+        for name, (entries, waiting, loss) in journals.items():
+            check = CellCheck(connection, name, on_rows)
+            check_key(connection, name, check.key)
             faults += check.run(entries, loss)
-    if expected and not any(
-        digest.startswith(expected) for check in checks for digest in check.digests
-    ):
+            newest = "".join(check.digests[-1:])
+            cells.append(CellHistory(name, len(check.digests), check.rows, newest, waiting))
+            digests += check.digests
+    if expected and not any(digest.startswith(expected) for digest in digests):
         faults.append(
             HistoryFault(
                 cell_id or "",
@@ -213,16 +215,6 @@ def verify_history(
                 "is in no entry: the history was cut off before it, or made anew",
             )
         )
-    cells = [
-        CellHistory(
-            cell_id=check.cell_id,
-            entries=len(check.digests),
-            rows=check.rows,
-            digest="".join(check.digests[-1:]),
-            waiting=journals[check.cell_id][1],
-        )
-        for check in checks
-    ]
     return HistoryReport(tuple(cells), tuple(faults))
 
 
