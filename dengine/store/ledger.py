@@ -44,6 +44,7 @@ from .schema import (
     LEDGER_KEY,
     SETTING,
     VERSION,
+    Query,
     insert_settings,
     read_setting,
     read_settings,
@@ -186,19 +187,19 @@ def check_key(connection: sa.Connection, cell_id: str, key: bytes, begin: bool =
 
 
 def newest_entry(connection: sa.Connection, cell_id: str) -> Any:
-    """Return a row (number, digest, chains) of a cell's newest ledger entry; None if it has none.
+    """Return the row of a cell's newest ledger entry; None if it has none.
 
     The ledger is the cell's hash chain, with an entry for each transaction. `digest` is 32 bytes.
     `chains` is JSON: by the name of the table (label, correction, model_version or setting) a
     digest over all rows that it has so far, for settings over the present ones. A table that never
     had a row is missing there.
     """
-    return connection.execute(
-        sa.select(*LEDGER.c["number", "digest", "chains"])
-        .where(LEDGER.c.cell_id == cell_id)
-        .order_by(LEDGER.c.number.desc())
-        .limit(1)
-    ).first()
+    return connection.execute(_entries_query(cell_id).limit(1)).first()
+
+
+def _entries_query(cell_id: str) -> Query:
+    """Return the query for the entries of a cell's ledger, newest first; it is not run."""
+    return sa.select(LEDGER).where(LEDGER.c.cell_id == cell_id).order_by(LEDGER.c.number.desc())
 
 
 def rows_digest(sums: Mapping[str, Iterable[bytes]]) -> bytes:
@@ -386,12 +387,7 @@ def find_integrity_error(connection: sa.Connection, cell_id: str, key: bytes, fi
         check_key(connection, cell_id, key)
     except StoreError as error:
         return f"{error}"
-    rows = connection.execute(
-        sa.select(LEDGER)
-        .where(LEDGER.c.cell_id == cell_id)
-        .order_by(LEDGER.c.number.desc())
-        .limit(2)
-    )
+    rows = connection.execute(_entries_query(cell_id).limit(2))
     newest, before = [*(row._asdict() for row in rows), {}, {}][:2]
     previous = before.get("digest", START)
     if newest and newest["digest"] != entry_digest(previous, newest | {"digest": None}, key):

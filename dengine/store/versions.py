@@ -26,6 +26,8 @@ from .records import (
 )
 from .schema import PRODUCT, VERSION, Query, lock
 
+KEPT = VERSION.c.state.is_not(None).label("kept")  # whether a version's arrays are there
+
 
 class VersionTable(CellTable):
     """Stores and loads model versions.
@@ -125,13 +127,10 @@ class VersionTable(CellTable):
                 lock(connection, PRODUCT, self._scope.product)
             # A peer's may have been stored before, or one that the engine dropped as too late.
             number = max(number, self._scope.newest_version(connection) + 1)
-            with_state = connection.execute(
-                self._accepted_query().where(VERSION.c.state.is_not(None))
-            ).all()
             dropped = [
                 stored.retrain
-                for stored in with_state
-                if not keeps_state(stored.version, number, self._keep)
+                for stored in connection.execute(self._accepted_query())
+                if stored.kept and not keeps_state(stored.version, number, self._keep)
             ]
             if dropped:
                 connection.execute(
@@ -263,13 +262,12 @@ class VersionTable(CellTable):
         StoreError
             For a stored value that cannot be read, and if the database fails.
         """
-        kept = VERSION.c.state.is_not(None).label("kept")
         n_bytes = sa.func.coalesce(sa.func.length(VERSION.c.state), 0).label("n_bytes")
         query = sa.select(
             *(column for column in VERSION.c if column.name != "state"),
             VERSION.c.retrain.label("number"),
             n_bytes,
-            kept,
+            KEPT,
         )
         scope = Scope(self._database.cell_id) if cell_only else self._scope
         rows = self._read(query.where(scope.shared(VERSION.c.cell_id)).order_by(VERSION.c.retrain))
@@ -294,7 +292,7 @@ class VersionTable(CellTable):
         whether its state (the stored arrays) is kept.
         """
         return (
-            sa.select(*VERSION.c["retrain", "version"], VERSION.c.state.is_not(None).label("kept"))
+            sa.select(*VERSION.c["retrain", "version"], KEPT)
             .where(self._shared, VERSION.c.accepted == sa.true())
             .order_by(VERSION.c.retrain.desc())
         )
