@@ -568,18 +568,19 @@ class Database:
         digest = hashlib.sha256(b"dengine " + self.cell_id.encode()).digest()
         key = int.from_bytes(digest[:8], signed=True)
         taken = connection.execute("SELECT pg_try_advisory_lock(%s)", [key]).fetchone()[0]
+        connection.commit()
+        if taken:
+            return
         holder_query = (
             "SELECT a.application_name FROM pg_locks l JOIN pg_stat_activity a USING (pid) WHERE "
             "l.locktype = 'advisory' AND (l.classid::bigint << 32) + l.objid::bigint = %s AND "
             "l.objsubid = 1 AND l.granted"
         )
-        holder = None if taken else connection.execute(holder_query, [key]).fetchone()
-        connection.commit()
-        if not taken:
-            connection.close()
-            raise owned_error(
-                holder[0] if holder else "another engine", f"cell {self.cell_id!r} of {self.name}"
-            )
+        holder = connection.execute(holder_query, [key]).fetchone()
+        connection.close()
+        raise owned_error(
+            holder[0] if holder else "another engine", f"cell {self.cell_id!r} of {self.name}"
+        )
 
     def own(self, table: sa.FromClause) -> sa.ColumnElement[bool]:
         """Return the SQL condition that a row of a table is this cell's."""
