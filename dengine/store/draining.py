@@ -15,7 +15,6 @@ from itertools import islice
 from typing import TYPE_CHECKING, Any
 
 from ..errors import StoreError, log
-from .journal import Journal
 from .lookup import DecisionIndex
 from .recording import RETRY_SECONDS, Recorder
 from .records import CHUNK, DATA_LOST, LOSS_REMEDY, LabelNumbers, T
@@ -36,12 +35,10 @@ class Drainer:
     Parameters
     ----------
     store : SqlStore
-    journal : Journal
     recorder : Recorder
+        Its limit holds for `drain` as well.
     index : DecisionIndex
         Records that the database has are removed from it.
-    limit : float
-        Seconds that `drain` waits at most.
 
     Attributes
     ----------
@@ -52,17 +49,14 @@ class Drainer:
     def __init__(
         self,
         store: SqlStore,
-        journal: Journal,
         recorder: Recorder,
         index: DecisionIndex,
-        limit: float,
     ) -> None:
         self.n_drained = 0
         self._store = store
-        self._journal = journal
+        self._journal = recorder.journal
         self._recorder = recorder
         self._index = index
-        self._limit = limit
         self._changed = recorder.changed
         self._wanted = 0  # up to this record somebody waits for the database
         self._error = ""
@@ -95,7 +89,7 @@ class Drainer:
         """
         fault = self._recorder.fault or self._error
         lag = self.lag
-        if fault or lag <= max(LAG_SECONDS, self._limit):
+        if fault or lag <= max(LAG_SECONDS, self._recorder.limit):
             return fault
         return f"no answer from the store for {lag:.1f} s."
 
@@ -117,7 +111,7 @@ class Drainer:
         (a local file), or in memory if the disk fails, and are copied later. After a timeout there
         is a `fault` until the database takes records again.
         """
-        limit = self._limit if seconds is None else seconds
+        limit = self._recorder.limit if seconds is None else seconds
         with self._changed:
             if self.is_drained:
                 return

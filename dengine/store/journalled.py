@@ -68,7 +68,7 @@ class JournalledStore(Outbox):
         self._index = DecisionIndex()
         self._recorder = Recorder(journal, store.clock, self.limit)
         self._changed = self._recorder.changed  # guards all of it
-        self._drainer = Drainer(store, journal, self._recorder, self._index, self.limit)
+        self._drainer = Drainer(store, self._recorder, self._index)
         try:
             self._compare_with_ledger()  # before anything is drained
             self._drain_leftovers()

@@ -64,6 +64,8 @@ class Recorder:
 
     Attributes
     ----------
+    journal, limit
+        As given.
     changed : threading.Condition
         With a reentrant lock. It guards this object, and is notified of every change.
     unwritten, synced : deque of Entry
@@ -80,9 +82,9 @@ class Recorder:
         self.n_recorded = 0
         self.n_synced = 0
         self.needs_drain = False
-        self._journal = journal
+        self.journal = journal
         self._clock = clock
-        self._limit = limit
+        self.limit = limit
         self.changed = threading.Condition(threading.RLock())
         self.unwritten: deque[Entry] = deque()
         self._wanted = 0  # up to this record somebody waits for a sync
@@ -100,7 +102,7 @@ class Recorder:
         be written.
         """
         seconds = time.monotonic() - self._began
-        if self._error or seconds <= self._limit:
+        if self._error or seconds <= self.limit:
             return self._error
         return f"the disk has not answered for {seconds:.1f} s."
 
@@ -153,7 +155,7 @@ class Recorder:
         if that takes longer, or a write fails meanwhile. The records are not lost then: the thread,
         unless it was stopped, tries to write them again.
         """
-        limit = self._limit if seconds is None else seconds
+        limit = self.limit if seconds is None else seconds
         with self.changed:
             place = self.n_recorded
             n_failed = self._n_failed
@@ -241,27 +243,27 @@ class Recorder:
         database had its records (the journal then still uses the lost file); the entries then stay
         in `unwritten`.
         """
-        if self._journal.end > LONG:  # a cell that never pauses would fill the disk
+        if self.journal.end > LONG:  # a cell that never pauses would fill the disk
             with self.changed:
                 self.needs_drain = True
                 self.changed.notify_all()
-                is_drained = self.changed.wait_for(lambda: self._journal.is_drained, BATCH_SECONDS)
+                is_drained = self.changed.wait_for(lambda: self.journal.is_drained, BATCH_SECONDS)
                 self.needs_drain = False
             if is_drained:  # without the lock: a disk that hangs would hang the cell
-                self._journal.clear()
+                self.journal.clear()
         blobs = [encode_record(entry.record) for entry in batch]
         try:
-            offsets = self._journal.append(blobs, self._clock())
+            offsets = self.journal.append(blobs, self._clock())
         except LostJournalError as error:
             log.error("%s It is created again with what the store lacks.", error)
             with self.changed:  # nobody reads it or writes its header meanwhile
-                self._journal.recreate()
+                self.journal.recreate()
             self.record_event(
                 "journal", f"{error} It was created again with what the store lacked."
             )
-            offsets = self._journal.append(blobs, self._clock())
+            offsets = self.journal.append(blobs, self._clock())
         with self.changed:
-            ends = [*offsets[1:], self._journal.end]
+            ends = [*offsets[1:], self.journal.end]
             for entry, offset, end in zip(batch, offsets, ends, strict=True):
                 entry.offset = offset
                 entry.end = end
