@@ -24,7 +24,7 @@ from ..files import FilePath, output_file
 from .connections import reading
 from .journal import Journal, Record, journal_path, read_undrained
 from .records import chunks
-from .schema import DECISION, LABEL, SETTING
+from .schema import DECISION, LABEL, read_cells
 from .sql import SqlStore
 from .verification import CellHistory, verify_history
 
@@ -100,7 +100,7 @@ def backup_store(url: FilePath, out: FilePath) -> BackupReport:
             "pg_dump copies it, once the engines have ended: their journals lie on their machines",
             StoreError,
         )
-        cells = sorted(connection.execute(sa.select(SETTING.c.cell_id).distinct()).scalars())
+        cells = read_cells(connection)
         paths = {cell: journal_path(connection.engine.url, cell) for cell in cells}
     # Journals first: a record that leaves its journal meanwhile is in the store by then.
     waiting = {cell: read_undrained(path)[0] for cell, path in paths.items() if path.exists()}

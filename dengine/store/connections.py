@@ -244,7 +244,6 @@ def reading(url: str) -> Iterator[sa.Connection]:
     engine = make_engine(url)
     name = engine.url.render_as_string()
     sqlite = engine.dialect.name == "sqlite"
-    options = {} if sqlite else {"isolation_level": "REPEATABLE READ", "postgresql_readonly": True}
     try:
         file = str(engine.url.database)
         if sqlite and not Path(file).is_file():
@@ -253,10 +252,13 @@ def reading(url: str) -> Iterator[sa.Connection]:
                 "`dengine train`, `dengine run` and DataEngine make a store."
             )
         with _store_errors("read", name), engine.connect() as connection:  # rolled back at the end
-            connection.execution_options(**options)
             if sqlite:  # read a text with a damaged byte too, so that its row can be named
                 plain: Any = connection.connection.driver_connection
                 plain.text_factory = lambda text: text.decode("utf-8", "backslashreplace")
+            else:
+                connection.execution_options(
+                    isolation_level="REPEATABLE READ", postgresql_readonly=True
+                )
             check_schema(connection, name)
             yield connection
     finally:

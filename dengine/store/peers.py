@@ -14,7 +14,7 @@ from ..recipe import Recipe
 from .connections import reading
 from .queries import Scope
 from .records import Settings
-from .schema import DECISION, LABEL, PRODUCT_KEY, SETTING
+from .schema import DECISION, LABEL, PRODUCT_KEY, SETTING, read_cells
 
 # Settings of a recipe on which the arrays of a version depend.
 EMBEDDING = ("reducer", "params", "folds", "window", "novelty")
@@ -110,7 +110,7 @@ def check_cell_exists(url: str, cell_id: str) -> None:
     `url` is a file, or a URL of SQLite or PostgreSQL.
     """
     with reading(url) as connection:
-        names = sorted(connection.execute(sa.select(SETTING.c.cell_id).distinct()).scalars())
+        names = read_cells(connection)
     if cell_id not in names:
         raise StoreError(
             f"Expected a cell of this store, got {cell_id!r}; it holds {', '.join(names)}. Name "

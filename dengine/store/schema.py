@@ -201,6 +201,11 @@ def read_settings(connection: sa.Connection, cell_id: str) -> dict[str, str]:
     return {row.key: row.value for row in connection.execute(query)}
 
 
+def read_cells(connection: sa.Connection) -> list[str]:
+    """Return the names of all robot cells that have used the store, sorted."""
+    return sorted(connection.execute(sa.select(SETTING.c.cell_id).distinct()).scalars())
+
+
 def read_setting(connection: sa.Connection, cell_id: str, key: str) -> str | None:
     """Return a setting of a robot cell, also one that the store itself keeps; None if there is
     none.
