@@ -121,7 +121,7 @@ class Candidate:
         """Note that the version is stored, and put the number that it got there in the report.
 
         It differs from the report's number if another robot cell of the product stored a version
-        first. With `version` 0 the report keeps its number.
+        first.
         """
         self.is_stored = True
-        self.report = replace(self.report, version=version or self.report.version)
+        self.report = replace(self.report, version=version)

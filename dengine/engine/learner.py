@@ -99,12 +99,11 @@ class Learner:
         thread that computes in advance for the next retrain (`precompute`). Raises StoreError if
         the store cannot be read, and the other errors of `LiveModel.resume`.
         """
-        version = self._store.versions.newest()
         reports = self._store.versions.retrains()
         for report in reports:
             self._note_outcome(report)
         newest_version = max((report.version for report in reports), default=0)
-        self.live.resume(version, newest_version, label_within, policy_since)
+        self.live.resume(newest_version, label_within, policy_since)
         self._refill_window(self.live.corrected_to)
         if self.live.answering is not None or len(self._window) >= IMPORTED:
             self.precompute()
@@ -650,7 +649,8 @@ class Learner:
         """
         self._outbox.check_integrity(0)  # the rule is rebuilt from all of it
         corrections = self._store.corrections.after(self.live.corrected_to)
-        self._refill_window(max([self.live.corrected_to, *(row.number for row in corrections)]))
+        corrected_to = corrections[-1].number if corrections else self.live.corrected_to
+        self._refill_window(corrected_to)
         self.live.rebuild_rule()
         # After the rule, whose outcomes the store may not give: a later call does not apply these
         # corrections again, so it would not know that the model must be retrained.

@@ -17,7 +17,6 @@ from ..records import ACTIONS, Decision, Reason, State
 from ..store.outbox import Outbox
 from ..store.records import (
     Correction,
-    ModelVersion,
     OutcomeRecord,
     StoredDecision,
     overdue_outcomes,
@@ -102,12 +101,11 @@ class LiveModel:
 
     def resume(
         self,
-        version: ModelVersion | None,
         newest_version: int,
         label_within: int,
         policy_since: int,
     ) -> None:
-        """Restore a stored version and learn the outcomes that came after it.
+        """Restore the newest stored version and learn the outcomes that came after it.
 
         A version is a trained model with its references (embedded labelled traces, which it counts
         near a new trace) and its decision rule, which turns the bounds of a success probability
@@ -136,8 +134,6 @@ class LiveModel:
 
         Parameters
         ----------
-        version : ModelVersion or None
-            The newest stored version, with its arrays; None before the first retrain.
         newest_version : int
             Largest number that a version ever had.
         label_within : int
@@ -156,6 +152,7 @@ class LiveModel:
         store = self.outbox.store
         since = self.evidence.since
         self.newest_version = newest_version
+        version = store.versions.newest()
         model = None
         if version is not None:
             trained_on = TrainedOn.from_state(version.state)
