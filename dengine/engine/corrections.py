@@ -26,7 +26,7 @@ from ..store.records import (
 )
 from ..traces import check_rate
 from .learner import Learner
-from .settings import BASELINE_SETTINGS, EvidenceWindow, SettingsInForce, refuse_idle
+from .settings import BASELINE_SETTINGS, EvidenceWindow, refuse_idle
 
 # Settings of a policy that make its rule, or that its evidence is measured by.
 SCORING = ("alpha", "lower_bound", "interval", "guarantee", "stops", "prices")
@@ -67,12 +67,11 @@ class Corrections:
 
     Parameters
     ----------
-    settings : SettingsInForce
     learner : Learner
     """
 
-    def __init__(self, settings: SettingsInForce, learner: Learner) -> None:
-        self._settings = settings
+    def __init__(self, learner: Learner) -> None:
+        self._settings = learner.live.settings
         self._learner = learner
         self._live = learner.live
         self._feedback = learner.feedback

@@ -36,7 +36,7 @@ from ..store.records import StoredDecision
 from ..traces import as_trace, infer_trace_spec
 from .guard import NOT_PRECOMPUTED, guarded
 from .live_model import LiveModel
-from .settings import SettingsInForce, read_peers_trace_spec
+from .settings import read_peers_trace_spec
 
 
 class DecisionMaker:
@@ -44,14 +44,13 @@ class DecisionMaker:
 
     Parameters
     ----------
-    settings : SettingsInForce
-        Read at each decision; the first trace without a fault sets the `TraceSpec` in them.
     live : LiveModel
-        Holds the model that decides; its outbox takes the decisions.
+        Holds the model that decides; its outbox takes the decisions. Its settings are read at each
+        decision; the first trace without a fault sets the `TraceSpec` in them.
     """
 
-    def __init__(self, settings: SettingsInForce, live: LiveModel) -> None:
-        self._settings = settings
+    def __init__(self, live: LiveModel) -> None:
+        self._settings = live.settings
         self._live = live
         self._outbox = live.outbox
         self._has_seen_trace = False  # a finite one, since the engine was made or opened

@@ -245,12 +245,12 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         self._outbox = open_outbox(store, recipe.window, reading=reading, patient=replaying)
         self._settings = SettingsInForce(settings, self._outbox)
         self._live = LiveModel(
-            template, TrainingWindow(recipe.window), self._outbox, settings.evidence
+            template, TrainingWindow(recipe.window), self._outbox, self._settings
         )
         peers = None
         if store.product is not None:
             peers = Peers(self._live, clock)
-        self._feedback = Feedback(self._live, self._settings, on_safe_mode)
+        self._feedback = Feedback(self._live, on_safe_mode)
         retrainer = Retrainer(
             self._live.window,
             None if replaying else recipe.budget,
@@ -259,8 +259,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
             clock,
         )
         self._learner = Learner(self._live, self._feedback, peers, retrainer)
-        self._maker = DecisionMaker(self._settings, self._live)
-        self._corrections = Corrections(self._settings, self._learner)
+        self._maker = DecisionMaker(self._live)
+        self._corrections = Corrections(self._learner)
         self.state = EngineState(self._learner)
         weakref.finalize(self, _close_forgotten, self._outbox)
 
@@ -282,8 +282,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         `LiveModel.resume` and `Feedback.resume`; StoreError if the store cannot be read is one of
         them.
         """
-        settings = self._settings.now
-        self._learner.resume(settings.recipe.policy.label_within, settings.policy_since)
+        self._learner.resume()
         self._feedback.resume()
         if self._retrains_in_line:
             self._wait_until_warm()

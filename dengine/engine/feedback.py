@@ -23,7 +23,6 @@ from ..store.records import (
     already_reported,
 )
 from .live_model import LiveModel
-from .settings import SettingsInForce
 
 # Called with the reason when a safe mode begins, and with "" when it ends.
 SafeModeListener = Callable[[str], object] | None
@@ -44,10 +43,8 @@ class Feedback:
     live : LiveModel
         Learns from the labels, and its outbox takes them. Its window takes each label that is
         recorded; in a product, whose robot cells share labels, `fleet.Peers` reads them from the
-        store instead.
-    settings : SettingsInForce
-        Whether an accepted part without a report is confirmed by the next decision, and since which
-        version.
+        store instead. Its settings say whether an accepted part without a report is confirmed by
+        the next decision, and since which version.
     on_safe_mode : callable or None
         Called with the reason when a safe mode begins and with "" when it ends, after that was
         recorded.
@@ -63,13 +60,11 @@ class Feedback:
         `learner.Learner` does it.
     """
 
-    def __init__(
-        self, live: LiveModel, settings: SettingsInForce, on_safe_mode: SafeModeListener
-    ) -> None:
+    def __init__(self, live: LiveModel, on_safe_mode: SafeModeListener) -> None:
         self._outbox = live.outbox
         self._live = live
         self._window = live.window
-        self._settings = settings
+        self._settings = live.settings
         self._on_safe_mode = on_safe_mode
         self.new_labels = 0
         self.remedy: Remedy | None = None

@@ -83,7 +83,7 @@ class Learner:
         # for.
         self._start: tuple[tuple[int, int], EngineModel, str] | None = None
 
-    def resume(self, label_within: int, policy_since: int) -> None:
+    def resume(self) -> None:
         """Restore training window, version, decision rule and count of new labels from the store.
 
         It is called when an engine opens the store. The training window holds the newest labelled
@@ -92,18 +92,16 @@ class Learner:
         these is damaged or missing, no model is in force. Damaged arrays and traces are reported by
         events (rows in the store's log). A difference between store and ledger (its hash chain)
         sets `integrity_error` of the outbox, through which the engine writes to the store; from
-        then on every part is verified (sent to the slow check). `label_within` is the number of
-        later decisions after which a check whose result was not reported is overdue (it counts as a
-        wrong decision), and `policy_since` the first version under the policy in force. If a model
-        is in force, or the training window has at least IMPORTED labels (500), this also starts a
-        thread that computes in advance for the next retrain (`precompute`). Raises StoreError if
-        the store cannot be read, and the other errors of `LiveModel.resume`.
+        then on every part is verified (sent to the slow check). If a model is in force, or the
+        training window has at least IMPORTED labels (500), this also starts a thread that computes
+        in advance for the next retrain (`precompute`). Raises StoreError if the store cannot be
+        read, and the other errors of `LiveModel.resume`.
         """
         reports = self._store.versions.retrains()
         for report in reports:
             self._note_outcome(report)
         newest_version = max((report.version for report in reports), default=0)
-        self.live.resume(newest_version, label_within, policy_since)
+        self.live.resume(newest_version)
         self._refill_window(self.live.corrected_to)
         if self.live.answering is not None or len(self._window) >= IMPORTED:
             self.precompute()
@@ -779,7 +777,7 @@ class Learner:
             self._store_and_swap_in(
                 event, model, live.trained_on, "another policy, the same model", 0.0
             )
-        live.change_evidence(template, evidence)
+        live.change_template(template)
 
     def _store_and_swap_in(
         self, event: Change, model: EngineModel, trained_on: TrainedOn, reason: str, seconds: float

@@ -24,7 +24,7 @@ from ..store.records import (
 from ..store.rule_progress import read_rule_progress
 from .guard import NO_REFERENCE, NOT_READY, RULE_MISSED, guarded
 from .resume import ChangedTracesError, add_labels_since, apply_correction, restore_model
-from .settings import EvidenceWindow
+from .settings import EvidenceWindow, SettingsInForce
 from .trainer import TrainedOn, TrainingWindow
 
 
@@ -41,8 +41,8 @@ class LiveModel:
         Of the labels that the next version is trained on.
     outbox : Outbox
         Through which the engine uses its store.
-    evidence : EvidenceWindow
-        Which decisions the rule in force is updated with.
+    settings : SettingsInForce
+        Which decisions the rule in force is updated with, and when a check is overdue.
 
     Attributes
     ----------
@@ -69,12 +69,12 @@ class LiveModel:
         template: EngineModel,
         window: TrainingWindow,
         outbox: Outbox,
-        evidence: EvidenceWindow,
+        settings: SettingsInForce,
     ) -> None:
         self.template = template
         self.window = window
         self.outbox = outbox
-        self.evidence = evidence
+        self.settings = settings
         self.answering: EngineModel | None = None
         self.version = 0
         self.newest_version = 0
@@ -83,6 +83,11 @@ class LiveModel:
         self.corrected_to = 0
         self.overdue: set[str] = set()
         self.overdue_to = 0
+
+    @property
+    def evidence(self) -> EvidenceWindow:
+        """Which decisions the rule in force is updated with."""
+        return self.settings.now.evidence
 
     @property
     def newest(self) -> EngineModel:
@@ -99,12 +104,7 @@ class LiveModel:
         """Number of the next version."""
         return self.newest_version + 1
 
-    def resume(
-        self,
-        newest_version: int,
-        label_within: int,
-        policy_since: int,
-    ) -> None:
+    def resume(self, newest_version: int) -> None:
         """Restore the newest stored version and learn the outcomes that came after it.
 
         A version is a trained model with its references (embedded labelled traces, which it counts
@@ -136,10 +136,6 @@ class LiveModel:
         ----------
         newest_version : int
             Largest number that a version ever had.
-        label_within : int
-            After how many later decisions a check without a report is overdue.
-        policy_since : int
-            Number of the first version under the present policy.
 
         Raises
         ------
@@ -150,7 +146,8 @@ class LiveModel:
             What a model raises that must be trained again.
         """
         store = self.outbox.store
-        since = self.evidence.since
+        settings = self.settings.now
+        since = settings.evidence.since
         self.newest_version = newest_version
         version = store.versions.newest()
         model = None
@@ -167,7 +164,11 @@ class LiveModel:
                     with_rule=version.version >= since,
                 )
         past = read_rule_progress(
-            store, None if model is None else version, since, label_within, policy_since
+            store,
+            None if model is None else version,
+            since,
+            settings.recipe.policy.label_within,
+            settings.policy_since,
         )
         self.overdue = set(past.overdue_ids)
         self.overdue_to = past.overdue_to
@@ -385,14 +386,9 @@ class LiveModel:
         guarded(NOT_READY, model.prepare, template)
         return template, model
 
-    def change_evidence(self, template: EngineModel, evidence: EvidenceWindow) -> None:
-        """Go on with another template, and other decisions that a rebuilt rule is updated with.
-
-        The template is the untrained model, from which the first version is trained. The rule is
-        not rebuilt here.
-        """
+    def change_template(self, template: EngineModel) -> None:
+        """Go on with another untrained model, from which the first version is trained."""
         self.template = template
-        self.evidence = evidence
 
     def get_state(self, model: EngineModel, trained_on: TrainedOn) -> State:
         """Return the arrays by name with which the store can restore a model as a version.
