@@ -115,7 +115,8 @@ class RecordInsertion:
             labelled[id_] = None
             if first is None:
                 new[id_] = label
-            elif _is_late_stop(label, first) and row.corrected != 0:  # else it is corrected already
+            # A late stop, unless a correction says the same already.
+            elif first.success != label.success and row.corrected != 0:
                 late_stops[id_] = None
         rows = [
             to_row(label) | {"quarantined": stored[label.decision_id].quarantined}
@@ -205,27 +206,22 @@ def _find_problem(label: NewLabel, row: Any, first: Any) -> str:
     `row` is the stored row of its decision, or None. `first` is the label that the decision has, or
     None; it is this row or a `NewLabel`. It is a problem if there is no row, or if its content hash
     or time is not that which the label names for its decision. A second label is a problem, unless
-    it repeats success and source of the first, or is a late stop (it says that an accepted part was
-    bad, after it had counted as good). A late stop is a problem if a person has withdrawn the first
-    label.
+    it repeats success and source of the first, or is a late stop: it reports a line stop of an
+    accepted part that had counted as good until then, for the next part came without a report. A
+    late stop is a problem if a person has withdrawn the first label.
     """
     if row is None:
         return f"{_describe(label)}, which the store does not hold"
     if (row.content_hash, row.time) != (label.content_hash, label.decided):
         return f"{_describe(label)}, of which the store holds another decision"
-    if first is None or (first.success, first.source) == (label.success, label.source):
+    if first is None:
         return ""
-    if _is_late_stop(label, first) and row.corrected != FORGOTTEN:
+    earlier = (first.success, first.source)
+    reported = (label.success, label.source)
+    is_late_stop = (earlier, reported) == LATE_STOP and row.corrected != FORGOTTEN
+    if earlier == reported or is_late_stop:
         return ""
     return f"a second label: {_describe(label)}, which has one"
-
-
-def _is_late_stop(label: NewLabel, first: Any) -> bool:
-    """Return whether a label reports a line stop of a part that had counted as good until then.
-
-    It had if `first`, its first label, is CONFIRMED: the next part came, and no stop was reported.
-    """
-    return ((first.success, first.source), (label.success, label.source)) == LATE_STOP
 
 
 def _describe(record: Record) -> str:
