@@ -412,7 +412,7 @@ class CellCheck:
                 begin, end = np.searchsorted(rows["entry"], (number, number + 1))
                 if begin < end:
                     of_entry[table] = rows["sum"][begin:end].tolist()
-            head = {name: value for name, value in row.items() if name != "digest"}
+            head = row | {"digest": None}
             # After an entry that was changed, its digest as stored and as computed are both
             # accepted as the one before: only that entry is a fault.
             computed = {entry_digest(digest, head, self.key) for digest in previous}
