@@ -11,7 +11,7 @@ from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future
 from contextlib import suppress
-from itertools import islice
+from itertools import chain, islice
 from typing import TYPE_CHECKING, Any
 
 from ..errors import StoreError, log
@@ -74,8 +74,8 @@ class Drainer:
     def lag(self) -> float:
         """Age in seconds of the oldest record that the database lacks; 0.0 if none."""
         with self._changed:
-            oldest = self._recorder.oldest
-        return 0.0 if oldest is None else time.monotonic() - oldest
+            oldest = next(chain(self._recorder.synced, self._recorder.unwritten), None)
+        return 0.0 if oldest is None else time.monotonic() - oldest.time
 
     @property
     def fault(self) -> str:

@@ -11,7 +11,7 @@ import time
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from itertools import chain, islice
+from itertools import islice
 
 from ..errors import NotTakenError, log
 from .journal import Journal, LostJournalError, Record, encode_record
@@ -110,15 +110,6 @@ class Recorder:
     def is_syncing(self) -> bool:
         """Whether the thread is writing a batch to the journal, or waits for its sync."""
         return not math.isinf(self._began)
-
-    @property
-    def oldest(self) -> float | None:
-        """Time of recording of the oldest record that the database lacks, by `time.monotonic`.
-
-        None if it lacks none. Hold `changed` meanwhile.
-        """
-        oldest = next(chain(self.synced, self.unwritten), None)
-        return None if oldest is None else oldest.time
 
     def record(self, record: Record) -> Entry:
         """Add a record in memory, and wake the thread that writes it to the journal.
