@@ -45,7 +45,7 @@ MUTATIONS = (  # what is broken, the file, a text that stands there once, what t
      "The journal deleted"),
     ("two engines may share a journal", STORE + "owned_file.py", "fcntl.LOCK_EX |", "fcntl.LOCK_SH |",
      "A second engine"),
-    ("a sync may take ten seconds", STORE + "recording.py", "self._limit if seconds is None else seconds", "10.0",
+    ("a sync may take ten seconds", STORE + "recording.py", "self.limit if seconds is None else seconds", "10.0",
      "A disk whose syncs hang"),
     ("labels are acknowledged at once", ENGINE + "engine.py", "            self._outbox.sync()  # before anything else",
      "            #", "A disk whose syncs fail"),
