@@ -292,8 +292,9 @@ class Learner:
         window, are as many as a training needs (`min_traces`).
         """
         n_new = self.feedback.new_labels
-        n_labels = max(n_new, len(self._window))
-        return n_new >= retrain_every and n_labels >= self.live.newest.min_traces
+        return n_new >= retrain_every and (
+            max(n_new, len(self._window)) >= self.live.newest.min_traces
+        )
 
     @property
     def is_swapping(self) -> bool:
@@ -303,7 +304,7 @@ class Learner:
     @property
     def is_at_work(self) -> bool:
         """Whether a training is under way in the executor, or its version is not in force yet."""
-        return self._retrainer.future is not None or self.is_swapping
+        return self._retrainer.future is not None or self._candidate is not None
 
     @property
     def is_busy(self) -> bool:
