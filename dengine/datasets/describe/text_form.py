@@ -323,9 +323,9 @@ def propose_marks(p: Proposal, cells: Collection[str]) -> None:
     `p` is the description so far. `1.043,5` can only be read with a decimal comma. The decimal mark
     is `?` (the user must answer), with a note, if point and comma read equally many numbers, or if
     more than 5 % of the numbers cannot be read at all; but not if no number has a point or comma.
-    The mark of thousands is `?`, with a note, if it is a point or comma, and no number has both a
-    point and a comma: `7,286` may be a fraction. It is "" if such a mark lets no further number be
-    read. If the decimal mark is stated, only this one is tried. Stated keys stay.
+    The mark of thousands is `?`, with a note, if it is a point or comma, and any number has this
+    mark and not the other one: `7,286` may be a fraction. It is "" if such a mark lets no further
+    number be read. If the decimal mark is stated, only this one is tried. Stated keys stay.
 
     cells : the different texts in the samples that are numbers with any of these marks.
     """
