@@ -136,7 +136,10 @@ def choose_files(p: Proposal, root: Path) -> bool:
     excluded = match_files(root, p.description.exclude)
     names = [name for name in names_in(root, stated) if name not in excluded]
     if not names:
-        raise DataError(f"Expected files of recordings, {listed(SUFFIXES)}, in {root}, got none.")
+        raise DataError(
+            f"Expected files of recordings, {listed(SUFFIXES)}, in {root}, got none; state files "
+            "for texts with another suffix, as in --set 'files=*.data'."
+        )
     endings = likely_endings(names)
     expect_data(
         bool(stated) or {*endings}.isdisjoint(FOREIGN),

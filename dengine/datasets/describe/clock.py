@@ -218,7 +218,7 @@ def _unit_by_size(column: Column, p: Proposal) -> str:
     if not step:
         p.notes["time.format"] = (
             f"no form of times that is known fits {listed([*column.odd][:3])}: state it, or "
-            "text.drop"
+            "time.column=[] and time.rate_hz, or text.drop"
         )
         return UNKNOWN
     if SECONDS[0] <= step <= SECONDS[1]:

@@ -374,7 +374,10 @@ def doubt_among(named: Sequence[LabelSource], counted: Counted) -> str:
     rivals = {tuple(counted[source].items()) for source in (counted if has_known else named)}
     if len(rivals) == 1 and named:
         return ""
-    return "none was found that is certain: state label.column, path, line or listing"
+    return (
+        "none was found that is certain: state label.column, path, line or listing; labels in JSON "
+        "or Excel go into a CSV with a column of file names first"
+    )
 
 
 def propose_label(p: Proposal) -> None:

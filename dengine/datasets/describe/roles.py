@@ -262,7 +262,7 @@ def propose_channels(p: Proposal, units: Mapping[str, str]) -> None:
     if len(best) == 1 and not doubts:
         p.put("channels", {best[0]: units[best[0]]})
         return
-    text = "no column has numbers that change"
+    text = "no column has numbers that change; a cell with a unit or a list in it is no number"
     if units:
         text = f"--set channels.COLUMN=UNIT for one or several of: {listed(units)}"
     keys = ("channels", f"channels.{UNKNOWN}")
