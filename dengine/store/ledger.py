@@ -187,14 +187,16 @@ def check_key(connection: sa.Connection, cell_id: str, key: bytes, begin: bool =
 
 
 def newest_entry(connection: sa.Connection, cell_id: str) -> Any:
-    """Return the row of a cell's newest ledger entry; None if it has none.
+    """Return a row (number, digest, chains) of a cell's newest ledger entry; None if it has none.
 
     The ledger is the cell's hash chain, with an entry for each transaction. `digest` is 32 bytes.
     `chains` is JSON: by the name of the table (label, correction, model_version or setting) a
     digest over all rows that it has so far, for settings over the present ones. A table that never
     had a row is missing there.
     """
-    return connection.execute(_entries_query(cell_id).limit(1)).first()
+    return connection.execute(
+        _entries_query(cell_id).with_only_columns(*LEDGER.c["number", "digest", "chains"]).limit(1)
+    ).first()
 
 
 def _entries_query(cell_id: str) -> Query:

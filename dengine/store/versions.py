@@ -129,8 +129,10 @@ class VersionTable(CellTable):
             number = max(number, self._scope.newest_version(connection) + 1)
             dropped = [
                 stored.retrain
-                for stored in connection.execute(self._accepted_query())
-                if stored.kept and not keeps_state(stored.version, number, self._keep)
+                for stored in connection.execute(
+                    self._accepted_query().where(VERSION.c.state.is_not(None))
+                )
+                if not keeps_state(stored.version, number, self._keep)
             ]
             if dropped:
                 connection.execute(
