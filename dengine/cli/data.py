@@ -63,11 +63,11 @@ def data(
     subcommand shows the saved description or, without one, a proposal, in which ? marks what you
     have to state with --set. While a ? is left, no recording is read by it, no picture is drawn,
     and --check ends with exit code 1; --save writes the description all the same, and later calls
-    propose anew what is not answered in it. Below the
-    description it shows what was read: the counts of traces and labels, and the recordings that
-    were left out, with the reasons. --out draws the traces, and how they drift. Look at them, and
-    write the description with --save, because every other subcommand needs it to read the
-    recordings; --save replaces a file that exists only with --force.
+    propose anew what is not answered in it. Below the description it shows what was read: the
+    counts of traces and labels, and the recordings that were left out, with the reasons. --out
+    draws the traces, and how they drift. Look at them, and write the description with --save,
+    because every other subcommand needs it to read the recordings; --save replaces a file that
+    exists only with --force.
 
     DATA may also be a source that needs no description: a bundled set (data that come with
     dengine), the file of a store (an engine's database), or an .npz file with X (traces, samples)

@@ -432,9 +432,14 @@ class Description:
 
     @property
     def listings(self) -> set[str]:
-        """The files that list labels or windows, as paths from the folder; also "." for none."""
-        names = (self.windows.listing, *(source.listing for source in self.labels))
-        return {PurePath(name).as_posix() for name in names}  # also ./labels.csv
+        """The files that list labels or windows, as paths from the folder of the recordings.
+
+        "." is among them if `[label]`, a `[[check]]` or `[windows]` names no such file.
+        """
+        return {
+            PurePath(name).as_posix()  # also ./labels.csv
+            for name in (self.windows.listing, *(source.listing for source in self.labels))
+        }
 
     @property
     def is_cut(self) -> bool:
@@ -550,8 +555,12 @@ def _made(kind: Any, value: Any, where: str) -> Any:
         value = {"unit": value}
     example = "NAME" if origin is Mapping else fields(kind)[0].name
     name = where.rpartition(", ")[2]
-    do = f"state keys in it, like {name}.{example}"
-    expect_data(isinstance(value, Mapping), f"{where} to be a table", value, do)
+    expect_data(
+        isinstance(value, Mapping),
+        f"{where} to be a table",
+        value,
+        f"state keys in it, like {name}.{example}",
+    )
     if origin is Mapping:
         return {
             str(name): _made(args[1], item, f"{where}.{name}")
@@ -646,8 +655,8 @@ def is_open(value: Any) -> bool:
 def as_option(key: str, value: Any) -> str:
     """Return how a key is stated on the command line, as a shell takes it: `--set order=name`.
 
-    A text is written as it is if it begins with a letter or `(` and has no quotes; any other value
-    is written as TOML.
+    A text is written as it is if it begins with `(`, or if it begins with a letter or `_`, has no
+    quotes and is one line. Any other value is written as TOML. `--set` reads both.
     """
     is_plain = isinstance(value, str) and re.fullmatch(r"[^\W\d][^\"'\n]*|\(.*", value)
     text = value if is_plain else toml_value(value)

@@ -118,8 +118,9 @@ def description_of(
 ) -> Description:
     """Return a description of recordings: the given one, the saved one, or a proposal.
 
-    A description says how recordings are read. Nothing in it is checked but keys and types (see
-    `check_description`), and nothing is saved.
+    A description says how recordings are read. A given Description or mapping is returned also with
+    `?` in it. Only keys and types are checked (see `check_description`), and nothing is saved. A
+    saved one without a channel counts as one with `?`.
 
     Parameters
     ----------
@@ -132,9 +133,9 @@ def description_of(
         Values of keys like `label.column`. They replace those in a description file, and a proposal
         keeps them. Not used if `description` is a Description or a mapping.
     propose : bool
-        Whether a description is proposed if none was saved, or one with `?` in it; the
-        proposal keeps its other values that are no defaults. If not, DataError is raised, unless
-        `stated` answers each `?`.
+        Whether a proposal is returned if no description was saved, or one with `?` in it. If not,
+        DataError is raised then; but if `stated` answers each `?` of a saved one, the proposal is
+        returned if it has no `?`. A proposal keeps the saved values that are no defaults.
 
     Raises
     ------
@@ -144,8 +145,8 @@ def description_of(
         unknown or its value of the wrong type, or a description cannot be read or proposed. Without
         `propose`, too, a proposal is made for the message, and its errors come first.
     SettingError
-        If a proposal is made, and a stated `windows.trigger`, the condition at which long
-        recordings are cut, is malformed.
+        If a proposal is made, and the `windows.trigger` that is stated or saved, the condition at
+        which long recordings are cut, is malformed.
     """
     if isinstance(description, Description):
         return description
@@ -177,7 +178,7 @@ def description_of(
 
 
 def missing_text(source: Path, path: Path, proposal: Description) -> str:
-    """Return the error message for recordings without a description at `path`, or one with `?`.
+    """Return the error message if there is no description at `path`, or one with `?` in it.
 
     A description says how the recordings at `source` are read. The message lists the keys of the
     proposed one whose value is `?`, so that the user must state it, with the notes on them, and has

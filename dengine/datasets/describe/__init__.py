@@ -243,15 +243,14 @@ def read_tables(p: Proposal) -> list[Table]:
 
     `p` is the description so far, and `p.names` are the files of recordings. At most 60 of them are
     read, spread evenly over all; if 60 of the size of the first have more than 2 MB, fewer, but at
-    least three. Of text files only those
-    count whose form (delimiter, number of columns, header) is the most frequent: the keys of
-    `[text]`, which state this form, are set in `p` first. Text files of another form move from
-    `p.names` to `p.others`, and `exclude` may be set to `?`: the user must say whether they are
-    recordings (`propose_form`). Tables with other column names than the most frequent ones, of
-    equally frequent ones those of the largest table, are left out (Parquet files of such tables
-    move to `p.others`), and so are damaged files. `p.is_cut` is set if only the beginning of a file
-    is used. Raises DataError if no file can be read, also because the package that reads such files
-    is missing.
+    least three. Of text files only those count whose form (delimiter, number of columns, header) is
+    the most frequent: the keys of `[text]`, which state this form, are set in `p` first. Text files
+    of another form move from `p.names` to `p.others`, and `exclude` may be set to `?`: the user
+    must say whether they are recordings (`propose_form`). Tables with other column names than the
+    most frequent ones, of equally frequent ones those of the largest table, are left out (Parquet
+    files of such tables move to `p.others`), and so are damaged files. `p.is_cut` is set if only
+    the beginning of a file is used. Raises DataError if no file can be read, also because the
+    package that reads such files is missing.
     """
     contents = dict[str, bytes]()
     faults: Faults = []

@@ -75,8 +75,9 @@ def propose_clock(p: Proposal) -> None:
         forms = [form_of(column, p) for column in clocks]
         p.put("time.format", forms)
         if UNKNOWN in forms and len(forms) > 1:
-            option = as_option("time.format", forms)
-            p.notes["time.format"] += f"; state all, with a form for ?: {option}"
+            p.notes["time.format"] += (
+                f"; state all, with a form for ?: {as_option('time.format', forms)}"
+            )
     elif names:
         p.put(
             "time.column",
@@ -92,9 +93,10 @@ def names_of_clocks(p: Proposal, clocks: Sequence[Column]) -> list[str]:
 
     `clocks` are the columns that may tell the time (`is_clock`). The result has these and, unless
     their cells tell the day, those that may be a part of a clock (`is_coarse`). If no column may
-    tell the time, it has all columns if they have no names, or if one is named `s`, which may be
-    seconds or the tool's position; otherwise those that may count the samples (`is_counter`). `p`
-    is the description so far. Raises SettingError for a malformed `windows.trigger`.
+    tell the time, it has all columns without a use if the files name none (`c0`, ...), or if one is
+    named `s`, which may be seconds or the tool's position; otherwise those that may count the
+    samples (`is_counter`). `p` is the description so far. Raises SettingError for a malformed
+    `windows.trigger`, and UnreadableError if cells are lists.
     """
     if clocks:
         has_days = any(has_day(form) for column in clocks for form in column.forms)
@@ -267,6 +269,7 @@ def propose_rate(p: Proposal, tables: Tables) -> None:
     means = [s[s >= 0].mean() for s in steps if (s >= 0).any()]
     usual = float(np.median(means or 0.0))
     if not is_rate(usual):
+        # Without any step, a fault says more: the first reading error stands in its place.
         why = [*unread * (not means), f"steps of {usual:.6g} s are of no force"][0]
         p.put(
             "time.rate_hz",
@@ -292,13 +295,13 @@ def propose_rate(p: Proposal, tables: Tables) -> None:
 
 
 def _order_by_times(p: Proposal, spans: Sequence[tuple[float, float]]) -> None:
-    """Set `order` in `p` to `time` if the recordings have dates, to `?` if their times contradict.
+    """Set `order` in `p` to `time` if the recordings have dates, to `?` if times contradict it.
 
-    They have dates if all start after 1999 (UTC). If they do not, but no two of them overlap in
-    time, so that one clock runs on through all, and they do not stand in the order of their times,
-    `order` is `?` (the user must answer), with a note. A stated `order` stays.
+    They have dates if all start after 1999 (UTC). If they do not, but no two of them overlap or
+    touch in time, so that one clock runs on through all, and `spans` is not sorted, `order` is `?`
+    (the user must answer), with a note. Otherwise, and if it is stated, `order` stays.
 
-    spans : the first and the last time of each recording, in seconds.
+    spans : the first and the last time of each recording, in seconds, in their order so far.
     """
     ordered = sorted(spans)
     if min(spans, default=(0.0,))[0] > YEARS[0]:

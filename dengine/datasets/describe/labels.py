@@ -107,8 +107,8 @@ def with_meanings(source: LabelSource, words: Names) -> LabelSource:
 
 def lists_words(source: LabelSource) -> bool:
     """Return whether a group in `source.path` spells out its words: `(ok|nok)`, not `([^/]+)`."""
-    group = r"\((?!\?)(?:[\w /|-]|\\\W)+\)"  # of words, with escaped marks
-    return re.search(group, source.path) is not None
+    # A group of words, with escaped marks.
+    return re.search(r"\((?!\?)(?:[\w /|-]|\\\W)+\)", source.path) is not None
 
 
 def in_paths(paths: Names) -> list[str]:
@@ -364,11 +364,12 @@ def doubt_on(label: LabelSource, counted: Counted, strays: Strings) -> str:
 
 
 def doubt_among(named: Sequence[LabelSource], counted: Counted) -> str:
-    """Return why no source may be the label, if none is certain; "" if only one may be it.
+    """Return "" if only one source may be the label, though none is certain; else what to state.
 
     `counted` has the words of each source by recording, and `named` those sources that are named
-    like a verdict or stated; there must be one. Sources that have the same word for each recording
-    count as one. Only the `named` ones count, or all, if any source has only known words.
+    like a verdict or stated; without any the text is returned. Only these are compared, or all in
+    `counted` if the words of any mean only good, bad or not checked (`is_known`). Sources that have
+    the same word for each recording count as one.
     """
     has_known = any(is_known(source, words) for source, words in counted.items())
     rivals = {tuple(counted[source].items()) for source in (counted if has_known else named)}

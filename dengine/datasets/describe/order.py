@@ -41,13 +41,15 @@ def propose_order(p: Proposal) -> None:
     `p` is the description so far. The files are sorted by path without the words in it that are
     labels; in the layout `columns` the columns' names count in place of files, as they stand. If
     this proves the order (`proves_order`), it is `name` if file names give the same order, else
-    `path`; if not, it is `name` if the names without folders are distinct and prove it, else `?`,
-    with a note. While `label.column` is `?`, paths are not looked at.
+    `path`. If not, `order`, which is `name` so far, stays if the file names without folders and
+    labels are distinct and prove it; else it is `?`, with a note. While `label.column` is `?`,
+    paths prove nothing, and `order` stays, too.
 
     In this order, or by name if it is not proved, parts are then compared. `order` is also `?` if
     part numbers, dates, times or counters of the recordings have another order (`unsorted_places`);
     of several such places the note is on the last. An `order` that the user stated stays. Raises
-    SettingError for a malformed `windows.trigger`, the condition at which long recordings are cut.
+    DataError if the listing of a stated check lacks its `key`, and SettingError for a malformed
+    `windows.trigger`, the condition at which long recordings are cut.
     """
     about = p.description
     tables = tables_of(p)
@@ -98,19 +100,24 @@ def proves_order(names: Strings) -> bool:
         days = groupby(zip(dates, names, strict=True), itemgetter(0))
         return all(proves_order([*map(itemgetter(1), day)]) for _, day in days)
     numbers = pieces[1 : date.start : 2] + pieces[date.stop + 1 :: 2]
+    # Numbers that each name has, and each another one: "" is where a name has none.
     counters = [row for row in numbers if len({*row, ""}) > len(names)]
     is_odd = any([*row] != sorted(row) or fits_all(DAY_FIRST, row) for row in counters)
     return pieces[first] in counters and not is_odd and may_count(pieces[first])
 
 
 def may_count(numbers: Sequence[int]) -> bool:
-    """Return whether numbers in names may count: their range is below ten times how many they are.
+    """Return whether numbers in names may count the parts.
 
-    Or they rise in equal steps. Random numbers, serial numbers with gaps and times of day seldom
-    do; seconds since 1970 and the like (`STAMP`) may.
+    They may in three cases: their range is below ten times how many they are; their steps are
+    equal; or all are like seconds since 1970 or a date with a time (`STAMP`). Random numbers,
+    serial numbers with gaps and times of day are seldom so.
     """
-    is_dense = max(numbers) - min(numbers) < MOST_GAPS * len(numbers)
-    return is_dense or len({*np.diff(numbers)}) == 1 or fits_all(STAMP, numbers)
+    return (
+        max(numbers) - min(numbers) < MOST_GAPS * len(numbers)
+        or len({*np.diff(numbers)}) == 1
+        or fits_all(STAMP, numbers)
+    )
 
 
 def find_date(pieces: Sequence[Any]) -> range:
@@ -164,10 +171,10 @@ def is_out_of_order(words: Strings, place: str, is_fixed: bool) -> bool:
 
 
 def _count(ranks: Sequence[Any]) -> bool:
-    """Return whether the last numbers in words, of which `sort_key` gives the ranks, count them.
+    """Return whether the last numbers in words count these; `ranks` has the `sort_key` of each.
 
-    They are more than two different whole numbers, and their range is below twice how many they
-    are.
+    There must be more than two words, each with a whole number, all different, and the largest
+    above the smallest by less than twice the number of words.
     """
     counts = [rank[-2] for rank in ranks if len(rank) > 1]
     is_whole = len({*counts}) == len(ranks) > 2 and not any(n % 1 for n in counts)
@@ -199,7 +206,10 @@ def unsorted_places(p: Proposal, tables: Tables) -> Iterator[tuple[str, str]]:
 
 
 def _sources(p: Proposal) -> Iterator[LabelSource]:
-    """Yield the places where words may rise from recording to recording, see `unsorted_places`."""
+    """Yield the places for `unsorted_places`, without that of the part numbers.
+
+    A listing that cannot be read is skipped. Raises SettingError for a malformed `windows.trigger`.
+    """
     yield from (LabelSource(column=column.name, at="first") for column in p.unused)
     yield from (LabelSource(line=line) for line in lines_of(p))
     for label in p.description.labels:

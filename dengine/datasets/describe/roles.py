@@ -101,14 +101,15 @@ def propose_roles(p: Proposal) -> None:
 
 
 def complete_rows(p: Proposal) -> None:
-    """Add the words that the user did not state to the stated `[rows]` in `p`, and apply it.
+    """Complete the stated `[rows]` in `p`, and leave out the rows that are no samples.
 
-    The other words of a column are added to `keep`, or to `drop` if `keep` is stated; `*` in their
-    place if they are more than 12, and nothing if `*` is stated. Rows that are no samples are left
-    out of `p.tables` and `p.columns`; a recording keeps all rows if it lacks a column of `[rows]`.
-    But a recording with one cell in such a column is left out as a whole if the word of this cell
-    drops it; if that leaves out all recordings, all of them stay. Raises DataError if none of the
-    words that `keep` states comes in its column.
+    The words of a column that `[rows]` does not state are added to `keep`, or to `drop` if `keep`
+    is stated; `*` in their place if they are more than 12, and nothing if `*` is stated. Rows that
+    are no samples are left out of `p.tables` and `p.columns`; a recording keeps all rows if
+    `[rows]` cannot be applied, for example if it lacks a column. But a recording with one cell in
+    such a column is left out as a whole if the word of this cell drops it; if that leaves out all
+    recordings, all of them stay. Raises DataError if none of the words that `keep` states, without
+    a `*`, comes in its column.
     """
     rows = dict(p.description.rows)
     for name, about in p.description.rows.items():
@@ -270,12 +271,14 @@ def propose_channels(p: Proposal, units: Mapping[str, str]) -> None:
 
 
 def likely_channels(units: Mapping[str, str]) -> list[str]:
-    """Return the columns that are likely channels, of those in `units`, which has their units.
+    """Return the columns that are likely channels.
 
-    The rules are tried in order, and the first that any column fits decides: a name like a force
-    along z; a name like a force, like `F` or like `value`, or a unit of force or torque; any
-    column. A name decides only if the unit is that of a force or torque, or unknown, "". If no
-    column that fits has a unit of force or torque, those that have one come behind them.
+    Three rules are tried, and all columns that fit the first one with any are returned: a name like
+    a force along z; a name like a force, like `F` or like `value`, or a unit of force or torque; no
+    condition. A name counts only if the unit is one of force or torque, or unknown. If no returned
+    column has a unit of force or torque, those that have one are added at the end.
+
+    units : the unit of each column that may be a channel, "" for unknown.
     """
     forces = [name for name, unit in units.items() if is_load(unit)]
     likely = [name for name, unit in units.items() if not unit or name in forces]
@@ -288,12 +291,13 @@ def likely_channels(units: Mapping[str, str]) -> list[str]:
 def _doubts_on(p: Proposal, names: Strings) -> Iterator[str]:
     """Yield the first reason why a column may not be a channel, for each that has one.
 
-    The reasons: the column is named like a value that a controller aims at or like a limit
-    (`F_soll`, `set_force`, `F_max`); its name is like `x*` and stands for the columns `x0`, `x1`,
-    ... of the first of `p.tables`, and these numbers do not rise evenly (`is_numbering`). `p` is
-    the description so far, and `p.tables` are the recordings that are looked at.
+    The reasons: the column is named like a set value, a limit, an error, an offset or the result of
+    a model (`F_soll`, `F_max`, `F_err`); its name is like `x*` and stands for the columns `x0`,
+    `x1`, ... of the first of `p.tables`, and these are fewer than 20, or their numbers do not rise
+    evenly (`is_numbering`). `p` is the description so far, and `p.tables` are the recordings that
+    are looked at.
 
-    names : of the columns.
+    names : the names of the columns.
     """
     origin = p.tables[0].origin if p.tables else {}
     for name in names:
