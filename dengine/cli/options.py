@@ -637,10 +637,11 @@ DATA = CHOICE | {
 def parse_stated(items: Iterable[str]) -> Values:
     """Return the values of `--set KEY=VALUE` by their keys, which stay texts like `label.column`.
 
-    A value is read as TOML; if it is not valid TOML, it is the text itself. Only the first `=` of
-    an item divides it, and white space around the key is removed. If a key comes twice, its last
-    value counts. Whether there is such a key is not checked. Raises click.UsageError for an item
-    without `=`, and for a text in brackets or braces that is not valid TOML.
+    A value is read as TOML; if it is true, false or not valid TOML, it is the text itself. Only the
+    first `=` of an item divides it, and white space around the key is removed. If a key comes
+    twice, its last value counts. Whether there is such a key is not checked. Raises
+    click.UsageError for an item without `=`, and for a text in brackets or braces that is not valid
+    TOML.
     """
     stated = Values()
     for item in items:

@@ -280,9 +280,10 @@ def format_value(name: str, value: Any) -> str:
         headings, of which those that are None or empty are left out. Of a mapping only the items
         that are not 0 are shown, each after its key, by which it is formatted; if there are none,
         the text is "none". Items are joined by commas; each of the three `prices` stands after its
-        title (check, escape or false reject); an empty list or tuple gives "". A number whose name
-        has no known ending has 4 significant digits, or is whole if it is a whole number, with
-        commas between thousands. Passwords of database URLs in a text are masked.
+        title: check, escape (a bad part that is accepted) or false reject. An empty list or tuple
+        gives "". A number whose name has no known ending has 4 significant digits, or is whole if
+        it is a whole number, with commas between thousands. Passwords of database URLs in a text
+        are masked.
 
     Raises
     ------

@@ -26,8 +26,7 @@ def check_description(description: Description) -> None:
     `order` of the parts is "time", there must be a column of times. If recordings with a column of
     times are resampled, there must be a rate. The settings in `[time]` and `[text]` must be valid,
     for example name an encoding that Python knows (`check_forms`). Nothing else is checked: neither
-    a trigger (the condition at which a part begins) nor a regular expression, nor whether columns
-    exist.
+    a trigger (the condition at which a part begins), nor whether columns exist.
     """
     if open_keys := description.open_keys:
         raise DataError(f"Expected a description without ?, still open: {listed(open_keys)}.")

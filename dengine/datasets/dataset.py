@@ -170,8 +170,9 @@ class Dataset:
         Its columns are `label`, `part` and `cause` if known, and one for each sample of each
         channel: `FZ_0`, `FZ_1`, ... Without channel names they are `x_0`, `x_1`, ... or, if there
         are several channels, `x0_0`, `x0_1`, ... Its metadata (`attrs`, under "dengine") has the
-        fields `channels`, `rate_hz`, `unit`, `limit` and `fit`, the number of channels and the
-        names of the columns of samples. So `load_dataset` reads what
+        fields `channels`, `rate_hz`, `unit`, `limit` (the range of the sensor) and `fit` (what is
+        done with live traces of another length), the number of channels and the names of the
+        columns of samples. So `load_dataset` reads what
         `data.to_frame().to_parquet("data.parquet")` writes, without a description, also if columns
         were added or moved. All other fields are lost. The frame may share its memory with X.
         """

@@ -155,6 +155,13 @@ class Channel:
     limit: float = 0.0
 
 
+def _check_path(path: str) -> None:
+    """Raise DataError unless a text is a regular expression with one group, empty, or `?`."""
+    wanted = "a regular expression with one group in path"
+    with instead(DataError, f"Expected {wanted}, got {path}", re.error):
+        expect_data(path in ("", UNKNOWN) or re.compile(path).groups == 1, wanted, path)
+
+
 @dataclass(frozen=True, slots=True)
 class PartSource:
     """Where the number of a part stands: `[part]`. Without it each recording is of another part.
@@ -171,6 +178,9 @@ class PartSource:
     column: Words = ()
     path: str = ""
     line: str = ""
+
+    def __post_init__(self) -> None:
+        _check_path(self.path)
 
 
 @dataclass(frozen=True, slots=True)
@@ -212,6 +222,9 @@ class LabelSource:
     good: Words = ()
     bad: Words = ()
     unchecked: Words = ()
+
+    def __post_init__(self) -> None:
+        _check_path(self.path)
 
     @property
     def meanings(self) -> dict[str, int | None]:

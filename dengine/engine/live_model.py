@@ -109,12 +109,12 @@ class LiveModel:
 
         A version is a trained model with its references (embedded labelled traces, which it counts
         near a new trace) and its decision rule, which turns the bounds of a success probability
-        into an action and is updated with the outcomes of parts. The restored version decides from
-        now on: it is in force. A model like umap-learn, of which not the fit but only the numbers
-        of its traces are stored, is trained on these traces again; any other is restored bit for
-        bit. Without a version, or if one of those traces is damaged or missing, no model is in
-        force, and the rule of the untrained model is updated with the stored outcomes since the
-        rule began.
+        into an action and is updated with the outcomes of parts. If the newest is damaged, the
+        newest intact one before it is taken. The restored version decides from now on: it is in
+        force. A model like umap-learn, of which not the fit but only the numbers of its traces are
+        stored, is trained on these traces again; any other is restored bit for bit. Without a
+        version, or if one of those traces is damaged or missing, no model is in force, and the rule
+        of the untrained model is updated with the stored outcomes since the rule began.
 
         Labels that came after the version was stored become references; in a product (several robot
         cells that share labels) only the labels of this cell do. Corrections since then, which
@@ -293,9 +293,9 @@ class LiveModel:
         never learns is only reset.
 
         An update that fails here is logged and makes the rule stale: every part is then verified
-        until the engine is opened again. A rule that was stale before stays so. The store's ledger
-        (its hash chain) is not checked here. Raises StoreError, and changes nothing, if the store
-        is unavailable.
+        until the engine is opened again, or a change of the policy begins a new rule. A rule that
+        was stale before stays so. The store's ledger (its hash chain) is not checked here. Raises
+        StoreError, and changes nothing, if the store is unavailable.
         """
         outcomes = self.outbox.call_store(
             lambda: self.outbox.store.labels.outcomes_since(0, self.evidence.since, self.overdue_to)

@@ -466,9 +466,11 @@ def check_model_settings(reducer: Any, given: Settings) -> None:
     A model that the user hands in decides by its own rule. `reducer` is the setting of that name,
     and `given` holds the other settings by name; None is a setting that was not given. Reducer,
     radius (of the neighbourhood whose labels count) and folds have no effect and must not be given.
-    In `given["policy"]` only the fields in `BASELINE_SETTINGS` have an effect: audit_rate, stops,
-    label_within, force_limits and shadow (every part is verified); `Policy` explains them. Any
-    other field must be at its default. Settings of other names pass.
+    In `given["policy"]` only the fields in `BASELINE_SETTINGS` have an effect: audit_rate (share of
+    certain decisions that are verified), stops (whether every bad accepted part stops the line),
+    label_within (after how many later decisions a missing report is overdue), force_limits (the
+    operator's limits of the signal) and shadow (every part is verified). Any other field must be at
+    its default. Settings of other names pass.
     """
     idle = [name for name in ("radius", "folds") if given.get(name) is not None]
     if reducer is not None:

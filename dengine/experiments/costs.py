@@ -656,7 +656,8 @@ def _within_reach(
     of the contender without shadow mode, in which every part is verified, and with some settings,
     an item of `changes`, which must hold the `guarantee` (the rule that decides). It is not tried
     if `Policy` refuses its settings, or if it needs more good parts before it can accept one
-    (`needed_parts`) than `n_good`, the number of good parts that a shuffle plays.
+    (`needed_parts`) than `n_good`, the mean number of good parts in a shuffle (a replay of the
+    recordings in random order).
     """
     policies = []
     out_of_reach = []

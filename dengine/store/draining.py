@@ -125,7 +125,7 @@ class Drainer:
                 raise self._unavailable()
 
     def _unavailable(self) -> StoreError:
-        """Return the StoreError for a store that cannot be reached now, with the reason."""
+        """Return the StoreError for a store that cannot be reached now; it names the `fault`."""
         return StoreError(
             f"The store is unavailable: {self.fault} Labels wait in its journal; "
             "try this again when it is back."

@@ -469,9 +469,9 @@ class CellCheck:
     def _check_pairs(self, table: sa.Table, required: sa.Table) -> Iterator[HistoryFault]:
         """Yield a fault for each row of the cell in `table` whose decision id `required` lacks.
 
-        Of `required`, too, only rows of the robot cell count. The fault names this table. If an
-        earlier check of the cell ended with a database error, nothing is read or yielded. Raise
-        SQLAlchemy's DatabaseError if a table cannot be read.
+        Of `required`, too, only rows of the robot cell count. The table that the fault names is
+        `required`. If an earlier check of the cell ended with a database error, nothing is read or
+        yielded. Raise SQLAlchemy's DatabaseError if a table cannot be read.
         """
         if self._is_unreadable:  # everything that could not be read would be missing
             return

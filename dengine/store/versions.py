@@ -119,7 +119,8 @@ class VersionTable(CellTable):
         is False), it has that number, and nothing else is done. Otherwise it gets the larger of
         that number and the number after the newest version of cell and product. The states (stored
         arrays) of older versions of cell and product are then deleted, except those that
-        `keeps_state` keeps: of the first version, of the newest, and of ever fewer before these.
+        `keeps_state` keeps: of the first version, of the `keep` newest (None: of all), and of ever
+        fewer before these.
         """
         number: int = row["version"]
         if row["accepted"]:
@@ -244,8 +245,9 @@ class VersionTable(CellTable):
         """Return every retrain of the robot cell or its product, oldest first.
 
         A product is robot cells that share labels and versions. Retrains whose version (the trained
-        model) was dropped, not put in force, are included, and so are the versions that a rollback,
-        its release or a change of the policy stored. No arrays are read.
+        model) was dropped, not put in force, are included, and so are the versions that a rollback
+        (an earlier version is put in force again and pinned), a release (retrains may replace the
+        pinned version again) or a change of the policy stored. No arrays are read.
 
         Parameters
         ----------

@@ -373,6 +373,8 @@ channels=FZ                    keys in it, like channels.NAME
 rows.tmie.keep=*               in the columns, got 'tmie'
 label.column=other             where [label] says they stand
 label.path=(                   a regular expression with one group
+part.path=part                 a regular expression with one group
+check=[{path="("}]              a regular expression with one group
 label.listing=x.csv            label.key
 text.encoding=utf-99           text.encoding
 text.encoding=undefined        text.encoding
@@ -392,7 +394,6 @@ label.column=?                 still open: label.column
 channels={}                    still open: channels
 traces.samples=0               traces.samples
 label={listing="list.csv", key="part", column="verdict", good="OK", bad="NOK"}  list.csv
-part.path=part                 one group
 time.format=parsec             time.format
 time.rate_hz=2e6               1 Hz to 1 MHz
 channels={FZ={limit=1.0}, "Weg ü"=""}  one limit
@@ -419,7 +420,7 @@ def test_another_listing_that_is_stated_keeps_the_column():
 def test_a_description_comes_back_from_its_toml(name, unit, word, pattern, note):
     description = Description(
         channels={name: Channel(unit, limit=0.1), "other": Channel()},
-        label=LabelSource(word, good=(word, "1"), path=pattern),
+        label=LabelSource(word, good=(word, "1"), path=f"({re.escape(pattern)})"),
         notes={"channels.?": note, "files": note},
     )
     assert name == "?" or Description.from_toml(description.to_toml()) == description

@@ -157,9 +157,9 @@ class RtdeRecorder(AbstractContextManager["RtdeRecorder"]):
         """Wait for the next insertion after the last one, or after a call of `arm`, and return it.
 
         An insertion (the robot inserts one part) begins when the trigger, a condition on the values
-        that the controller sends, is met. It may have begun before this call: the packages (the
-        values sent at once) of the last 60 s are buffered. What came earlier and was not read is
-        lost, and `arm` discards what has come.
+        that the controller sends, is met after it was not met for its `quiet_s` seconds. It may
+        have begun before this call: the packages (the values sent at once) of the last 60 s are
+        buffered. What came earlier and was not read is lost, and `arm` discards what has come.
 
         An insertion that is not complete after `timeout` seconds, for example because the
         controller fell silent, is returned with NaN for the missing samples. If packages are

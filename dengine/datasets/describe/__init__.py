@@ -17,7 +17,17 @@ from ..checks import check_forms
 from ..dataset import Faults, expect_data
 from ..description import UNKNOWN, Clock, Description, Stated, Strings, flat, is_open
 from ..read.bags import BAG
-from ..read.files import as_source, caught, match_files, natural_key, read_file
+from ..read.files import (
+    FOREIGN,
+    SUFFIXES,
+    as_source,
+    caught,
+    match_files,
+    names_in,
+    natural_key,
+    read_file,
+    suffix_of,
+)
 from ..read.frames import read_frame
 from ..read.places import without_suffix
 from ..read.split import table_of
@@ -30,31 +40,6 @@ from .layout import MOST_PARTS, layout_of, parts_of
 from .roles import propose_roles
 from .text_form import MOST_BYTES, propose_form
 
-# The format of files with each suffix; `.gz` may stand behind it.
-SUFFIXES = {
-    ".csv": "text",
-    ".tsv": "text",
-    ".txt": "text",
-    ".dat": "text",
-    ".asc": "text",
-    ".lvm": "text",
-    ".log": "text",
-    ".prn": "text",
-    ".json": "json",
-    ".jsonl": "jsonl",
-    ".ndjson": "jsonl",
-    ".parquet": "parquet",
-    ".npz": "npz",
-    ".ts": "ts",
-    ".mcap": "mcap",
-    ".db3": "mcap",
-}
-# Formats of recordings that other packages read.
-FOREIGN = (".npy", ".mat", ".h5", ".hdf5", ".tdms", ".bag", ".xlsx", ".xls", ".feather", ".pkl")
-# Hidden files, pages for people, and descriptions.
-NO_RECORDING = re.compile(
-    r"(?i)(^|/)(\.|(readme|licen[sc]e|notes|changelog)(\.[^/]*)?$|recordings\.toml$)"
-)
 MOST_FILES = 60  # that are read
 MOST_ROWS = 50_000
 MOST_PIECES = 4  # of a part's curve, in files with numbers behind their names
@@ -197,34 +182,6 @@ def signal_endings(names: Strings) -> Strings:
     if len(endings) > MOST_PIECES or n_parts < LEAST_PARTS:
         no_signal += r"|\d"
     return endings if is_grid and not re.search(no_signal, " ".join(endings)) else []
-
-
-def suffix_of(name: str) -> str:
-    """Return the suffix of a file with its dot, in small letters; "" if there is none.
-
-    Of `x.csv.gz` it is `.csv`.
-    """
-    return Path(name.lower().removesuffix(".gz")).suffix
-
-
-def names_in(root: Path, patterns: Strings) -> Strings:
-    """Return the files of a folder that may be recordings: relative paths, run_2 before run_10.
-
-    Hidden files, files in hidden folders or outside of the folder (`../x.csv`), `recordings.toml`,
-    and files like README or LICENSE are left out. Without `patterns`, only files with a suffix of
-    recordings, like .csv or .json, are returned. If `root` is a file, the list has only its name.
-    If nothing is there, the list is empty. Raises DataError for a malformed pattern, unless `root`
-    is a file.
-
-    patterns : patterns of the files, like `*.csv`; empty: all files below the folder.
-    """
-    if root.is_file():
-        return [root.name]
-    names = match_files(root, patterns or ["**/*"])
-    names -= {*filter(NO_RECORDING.search, names)}
-    return sorted(
-        (n for n in names if patterns or suffix_of(n) in (*SUFFIXES, *FOREIGN)), key=natural_key
-    )
 
 
 def globs(names: Strings) -> list[str]:

@@ -192,7 +192,7 @@ def part_words(source: PartSource, tables: Tables) -> Words:
 
     `source` says where the number stands; if it states nothing, each number is "". `tables` has the
     table of each recording. Recordings whose number is missing, empty or not the same in all rows
-    are left out. Raises DataError if the path in `source` is no regular expression with one group.
+    are left out.
     """
     words = dict[str, str]()
     for table in tables:
@@ -236,9 +236,9 @@ def words_of(p: Proposal, source: LabelSource, tables: Tables, parts: Words) -> 
     in a listing (a file with a row for each recording or part). `p` is the description as far as it
     is made, `tables` has the table of each recording, and `parts` their part numbers. A recording
     for which the listing has rows with different words has none. The mapping is empty if no
-    recording has a word, also because `source.path` is no regular expression with one group; but if
-    the source is `p.description.label`, which the user stated, DataError is raised then. Raises
-    DataError if the source's listing cannot be read or lacks a column.
+    recording has a word; but if the source is `p.description.label`, which the user stated,
+    DataError is raised then. Raises DataError if the source's listing cannot be read or lacks a
+    column.
     """
     words = dict[str, str]()
     faults: Faults = []
@@ -345,10 +345,12 @@ def is_known(source: LabelSource, words: Words) -> bool:
 def doubt_on(label: LabelSource, counted: Counted, strays: Strings) -> str:
     """Return why a source, though certain in itself, may not be the label; "" if nothing does.
 
-    `counted` has the words of each source, also of `label`, by recording. Another source may say
-    bad where this one says good, or good where it says bad, or have words without a known meaning
-    that may contradict it (`may_contradict`). The first such source gives the reason; without one,
-    any listing with a verdict that names too few recordings does, on which `strays` has a text.
+    A source is a place that may hold the labels, like a column, a path or a listing (a file with a
+    row for each recording or part). `counted` has the words of each source, also of `label`, by
+    recording. Another source may say bad where this one says good, or good where it says bad, or
+    have words without a known meaning that may contradict it (`may_contradict`). The first such
+    source gives the reason. Without one, the reason is a fixed text if `strays` is not empty; it
+    has a text on each listing with a verdict that names too few recordings.
     """
     words = counted[label]
     for source, others in counted.items():

@@ -39,16 +39,18 @@ def propose_order(p: Proposal) -> None:
     """Set `order` in `p` to what the paths of the files prove, `name` or `path`, else to `?`.
 
     `p` is the description so far. The files are sorted by path without the words in it that are
-    labels; in the layout `columns` the columns' names count in place of files, as they stand. If
-    this proves the order (`proves_order`), it is `name` if file names give the same order, else
-    `path`. If not, `order`, which is `name` so far, stays if the file names without folders and
-    labels are distinct and prove it; else it is `?`, with a note. While `label.column` is `?`,
-    paths prove nothing, and `order` stays, too.
+    labels; in the layout `columns` the columns' names count in place of files, as they stand. They
+    prove the order in which the parts were made if dates or counting numbers in them rise
+    (`proves_order`). `order` is then `name` if file names give the same order, else `path`. If not,
+    `order`, which is `name` so far, stays if the file names without folders and labels are distinct
+    and prove it; else it is `?`, with a note. While `label.column` is `?`, paths prove nothing, and
+    `order` stays, too.
 
     In this order, or by name if it is not proved, parts are then compared. `order` is also `?` if
     part numbers, dates, times or counters of the recordings have another order (`unsorted_places`);
     of several such places the note is on the last. An `order` that the user stated stays. Raises
-    DataError if the listing of a stated check lacks its `key`, and SettingError for a malformed
+    DataError if a check that the user stated (a source of labels that must agree) has a listing (a
+    file with a row for each part or recording) without its `key`, and SettingError for a malformed
     `windows.trigger`, the condition at which long recordings are cut.
     """
     about = p.description
@@ -144,18 +146,18 @@ def fits_all(pattern: re.Pattern[str], pieces: Sequence[Any]) -> bool:
 def is_out_of_order(words: Strings, place: str, is_fixed: bool) -> bool:
     """Return whether words that should rise from recording to recording do not.
 
-    Rising means in the order of `sort_key`. Dates and times should rise, like 2026-01-31,
-    20260131_235959 or seconds since 1970, and in a place that is named like them any words with
-    five digits or more. If `sort_key` cannot order one of them, like 01/31/26 (`is_unsorted`), they
-    do not rise.
+    Rising means in the order of `sort_key`. Words that are all equal need not rise. Dates and times
+    should rise, like 2026-01-31, 20260131_235959 or seconds since 1970, and in a place that is
+    named like them any words with five digits or more. If `sort_key` cannot order one of them, like
+    01/31/26 (`is_unsorted`), they do not rise.
 
     Other words should rise only if the place is fixed, all words are different, and one of these
     holds: they are sorted as texts (P10 before P2); they fall throughout; or the last numbers in
-    them count the recordings. Those are more than two different whole numbers, of which the largest
-    is above the smallest by less than twice the number of words.
+    them count the recordings. Those are more than two whole numbers, all different, of which the
+    largest is above the smallest by less than twice the number of words.
 
-    words : the word of each recording, in the order to be compared. place : the name of their
-    place. is_fixed : whether the place has one word for each recording.
+    words : the word of each recording, in the order to be compared. place : the name of the column
+    or line in which they stand. is_fixed : whether the place has one word for each recording.
     """
     if len({*words}) == 1:
         return False

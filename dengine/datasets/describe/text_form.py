@@ -67,14 +67,15 @@ def look(content: bytes, stated: Stated) -> Look:
 
     Only its first 2 million characters are looked at. The result has the text form (encoding,
     delimiter, lines of the header, of the units and of the first samples), the number of cells in a
-    row, the line of the header ("" for none) and the cells of each line from the first row of
-    samples on, also of lines of another form. The delimiter, which is the one that best splits the
-    lines into numbers, and the first row follow from the first 200 lines; of equally good
-    delimiters the one with more cells is taken. If none splits the usual line into cells, there is
-    a single column, and the delimiter is a semicolon, or the stated one. The decimal mark and the
-    mark of thousands are not looked for: the text form has the defaults. `content` has the bytes of
-    the file. Raises DataError if it is empty or no text, or if the line of its header is not
-    certain, and LookupError for a stated encoding that Python does not know.
+    row, the line of the header ("" for none), the cells of each line from the first row of samples
+    on, also of lines of another form, and whether the last cell of each row is empty. The
+    delimiter, which is the one that best splits the lines into numbers, and the first row follow
+    from the first 200 lines; of equally good delimiters the one with more cells is taken. If none
+    splits the usual line into cells, there is a single column, and the delimiter is a semicolon, or
+    the stated one. The decimal mark and the mark of thousands are not looked for: the text form has
+    the defaults. `content` has the bytes of the file. Raises DataError if it is empty or no text,
+    or if the line of its header is not certain, and LookupError for a stated encoding that Python
+    does not know.
 
     stated : keys that the user gave. `text.encoding` and `text.delimiter` are taken, and so is
     `text.header` if it is a text, with which the header begins, unless no line above the samples

@@ -8,11 +8,36 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from ...errors import DataError, instead, shortened
+from ...errors import DataError, instead, listed, shortened
 from ..dataset import Fault, Faults
 from ..description import FOLDER_FILE, Description, Strings
 from ..table import UnreadableError
 
+# The format of files with each suffix; `.gz` may stand behind it.
+SUFFIXES = {
+    ".csv": "text",
+    ".tsv": "text",
+    ".txt": "text",
+    ".dat": "text",
+    ".asc": "text",
+    ".lvm": "text",
+    ".log": "text",
+    ".prn": "text",
+    ".json": "json",
+    ".jsonl": "jsonl",
+    ".ndjson": "jsonl",
+    ".parquet": "parquet",
+    ".npz": "npz",
+    ".ts": "ts",
+    ".mcap": "mcap",
+    ".db3": "mcap",
+}
+# Formats of recordings that other packages read.
+FOREIGN = (".npy", ".mat", ".h5", ".hdf5", ".tdms", ".bag", ".xlsx", ".xls", ".feather", ".pkl")
+# Hidden files, pages for people, and descriptions.
+NO_RECORDING = re.compile(
+    r"(?i)(^|/)(\.|(readme|licen[sc]e|notes|changelog)(\.[^/]*)?$|recordings\.toml$)"
+)
 DATE = re.compile(r"(?<![0-9])([0-9]{1,2})\.([0-9]{1,2})\.([0-9]{4})(?![0-9])")
 HALF_DAY = re.compile(r"\d ?[aApP][mM](?![A-Za-z])")
 # Dates and times that are in another order than the numbers in them.
@@ -94,6 +119,34 @@ def match_files(root: Path, patterns: Strings) -> set[str]:
         }
 
 
+def suffix_of(name: str) -> str:
+    """Return the suffix of a file with its dot, in small letters; "" if there is none.
+
+    Of `x.csv.gz` it is `.csv`.
+    """
+    return Path(name.lower().removesuffix(".gz")).suffix
+
+
+def names_in(root: Path, patterns: Strings) -> Strings:
+    """Return the files of a folder that may be recordings: relative paths, run_2 before run_10.
+
+    Hidden files, files in hidden folders or outside of the folder (`../x.csv`), `recordings.toml`,
+    and files like README or LICENSE are left out. Without `patterns`, only files with a suffix of
+    recordings, like .csv or .json, are returned. If `root` is a file, the list has only its name.
+    If nothing is there, the list is empty. Raises DataError for a malformed pattern, unless `root`
+    is a file.
+
+    patterns : patterns of the files, like `*.csv`; empty: all files below the folder.
+    """
+    if root.is_file():
+        return [root.name]
+    names = match_files(root, patterns or ["**/*"])
+    names -= {*filter(NO_RECORDING.search, names)}
+    return sorted(
+        (n for n in names if patterns or suffix_of(n) in (*SUFFIXES, *FOREIGN)), key=natural_key
+    )
+
+
 def find_files(root: Path, description: Description) -> list[str]:
     """Return the files that a description names, as paths relative to the folder.
 
@@ -113,6 +166,20 @@ def find_files(root: Path, description: Description) -> list[str]:
             f"description of another folder? See `dengine data {root}`."
         )
     return sorted(names, key=file_key)
+
+
+def unread_note(source: Any, description: Description) -> str:
+    """Return a note that lists files of a folder that the description does not mention; "" if none.
+
+    They have a suffix of recordings, like .csv or .json (`names_in`), match neither `files` nor
+    `exclude`, and are no listing that the description names. There are none in a source that is no
+    folder.
+    """
+    if not isinstance(source, Path) or source.is_file():
+        return ""
+    known = match_files(source, (*description.files, *description.exclude))
+    others = [n for n in names_in(source, ()) if n not in known | description.listings]
+    return f"Not read, for neither files nor exclude has them: {listed(others)}." if others else ""
 
 
 def read_file(path: Path) -> bytes:

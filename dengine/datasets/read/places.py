@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from operator import eq
 from pathlib import Path
 
-from ...errors import DataError, instead, listed, shortened
+from ...errors import DataError, listed, shortened
 from ..dataset import Fault
 from ..description import Description, LabelSource, PartSource, Strings, TextForm
 from ..table import Table, UnreadableError
@@ -27,8 +27,7 @@ def stem_of(description: Description, path: str) -> str:
     """Return a path without its suffix, and without the words in it that are labels or checks.
 
     Of each match of a regular expression for labels, `source.path`, the text of its group is
-    removed. Raises re.error if that is no regular expression, and IndexError if it matches but has
-    no group.
+    removed.
     """
     path = without_suffix(path)
     for source in description.labels:
@@ -52,14 +51,9 @@ def path_word(path: str, pattern: str) -> str:
     """Return what the group of a regular expression matches in a path without the file's suffix.
 
     The first match in the path counts. Raises UnreadableError if `pattern` or its group does not
-    match, and DataError if it is no regular expression with exactly one group.
+    match.
     """
-    wanted = f"Expected a regular expression with one group, got {pattern}"
-    with instead(DataError, wanted, re.error):
-        expression = re.compile(pattern)
-    if expression.groups != 1:
-        raise DataError(f"{wanted}.")
-    match = expression.search(without_suffix(path))
+    match = re.search(pattern, without_suffix(path))
     if match is None or match[1] is None:
         raise UnreadableError(f"Expected {pattern} in the path, it is not found")
     return match[1]
@@ -102,8 +96,7 @@ def words_of(
     cell: that of all rows if `at` is "same", or of the "first" or "last" row. Raises
     UnreadableError if a column, the line or a match in the path is missing, if a column has lists
     or no rows, if the words of the rows differ and `at` is "same", or if several lines with this
-    beginning have different words. Raises DataError if what is stated for the path is no regular
-    expression with exactly one group.
+    beginning have different words.
     """
     if source.path:
         return [path_word(table.path, source.path)]
@@ -119,8 +112,7 @@ def part_of(source: PartSource, table: Table) -> str:
     file or in a line above the header. The words of several columns are joined by blanks. Raises
     UnreadableError if a stated column, line or match in the path is missing or its word is empty,
     if the words of the recording's rows, or of several lines with the stated beginning, differ, or
-    if a column has lists or no rows; and DataError if what is stated for the path is no regular
-    expression with one group.
+    if a column has lists or no rows.
     """
     words = words_of(source, table, source.column)
     if not all(words):
@@ -192,8 +184,6 @@ class LabelReader:
             rows. If the words differ in several such lines, in rows of the listing with the key or,
             if `source.at` is "same", in the recording's rows. If the key is not the part's number,
             and was found for another path before.
-        DataError
-            If `source.path` is no regular expression with one group.
         """
         source = self.source
         path = table.path
@@ -303,8 +293,7 @@ def read_labels(source: LabelSource, read_listing: ListingReader) -> LabelReader
     part. `read_listing` is called with its name (see `listing_table`). Raises DataError if it
     cannot be read, or if `source.key` and `source.column`, the columns in it that name the
     recording or part and have the label, are not both stated and there, and LookupError for an
-    encoding that Python does not know. Whether `source.path` is a regular expression is not checked
-    here.
+    encoding that Python does not know.
     """
     listing = defaultdict[str, set[str]](set)
     if source.listing:

@@ -22,7 +22,16 @@ from ..table import Recording, Table, UnreadableError, as_word
 from ..units import bare, conversion, unit_in
 from .bags import read_bag
 from .clock import check_steps, times_of
-from .files import caught, find_files, first_of, is_unsorted, natural_key, read_file, sort_key
+from .files import (
+    caught,
+    find_files,
+    first_of,
+    is_unsorted,
+    natural_key,
+    read_file,
+    sort_key,
+    unread_note,
+)
 from .frames import read_frame
 from .places import LabelReader, listing_table, part_of, read_labels, stem_of
 from .split import split, table_of
@@ -62,7 +71,7 @@ def recording_of(
         If the table does not follow the description, is damaged, or has too few or too many samples
         for a trace, by its section `[traces]`.
     DataError
-        If a regular expression or a format of times in the description is invalid.
+        If a format of times in the description is invalid.
     """
     clock = description.time
     table = kept_rows(table.whole(), description.rows)
@@ -174,8 +183,7 @@ def label_of(labels: Sequence[LabelReader], table: Table, part: str) -> int | No
     part that it found to its `used`. Raises UnreadableError if a source has no label for the part,
     a word without a stated meaning or contradictory rows, or if the sources do not agree, also if
     only one of them says that it was not checked. Raises it also if another file had the key in a
-    listing before, unless the key is the number of the part, which several files may have. Raises
-    DataError if what a source states for the path is no regular expression with one group.
+    listing before, unless the key is the number of the part, which several files may have.
     """
     by_source = [reader.label(table, part) for reader in labels]
     for i, label in enumerate(by_source):
@@ -251,7 +259,7 @@ def read_recordings(
         )
     n_found = len(recordings) + len(faults) + n_unlabelled
     n_seen = description.seen.recordings
-    notes = [label.unused_note() for label in labels]
+    notes = [unread_note(source, description), *(label.unused_note() for label in labels)]
     if n_found < n_seen:
         notes.append(f"The description was made for {n_seen} recordings, now there are {n_found}.")
     return replace(
