@@ -125,6 +125,13 @@ def listing(bag: Bag, path: Path, first: int = 0) -> None:
     path.write_text("\n".join(rows))
 
 
+def test_several_labels_before_the_next_part_are_a_fault(bag, tmp_path):
+    data = read(bag.write(tmp_path / "cell.mcap"), **{"traces.samples": SAMPLES + REST + 1})
+    agree = bag.good[::2] == bag.good[1::2]  # every other part begins within the one before
+    assert len(data) == agree.sum()
+    assert [f"{CHECK} before" in str(fault) for fault in data.faults] == [True] * (~agree).sum()
+
+
 @pytest.mark.parametrize("stamped", [True, False])
 def test_a_bag_is_cut_by_its_trigger_and_labelled_by_a_topic(bag, tmp_path, stamped):
     if not stamped:

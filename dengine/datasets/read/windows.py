@@ -31,7 +31,8 @@ def cut(table: Table, description: Description, base: Path) -> Iterator[Table]:
     `damage` (an error for which it is left out) if a trigger begins it in a gap of the times, or if
     a window of the listing has no samples, overlaps an earlier one, or goes beyond the recording.
     If the labels are a topic of a ROS bag, that column has at most one cell: the first label
-    between the start of the part and the start of the next. Raises DataError if `time.column` is
+    between the start of the part and the start of the next; different labels there are damage, too,
+    since a part may be missing. Raises DataError if `time.column` is
     not stated, if a trigger cuts and the rate is not stated, if no part is found, if the recording
     has damage, or if times, signals, labels or the listing cannot be read, SettingError for a
     malformed trigger, and LookupError for a listing in an encoding that Python does not know.
@@ -52,7 +53,10 @@ def cut(table: Table, description: Description, base: Path) -> Iterator[Table]:
         verdicts = {}
         for topic in verdicts_of(description):
             words = table.column(topic)[rows.start : end]
-            verdicts[topic] = words[pd.notna(words)][:1]
+            words = words[pd.notna(words)]
+            verdicts[topic] = words[:1]
+            if len({*words}) > 1:
+                fault = f"Expected one label in {topic} before the next part, got several"
         yield replace(
             part,
             source=f"{name}, {key}",
