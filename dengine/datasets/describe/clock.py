@@ -120,13 +120,13 @@ def is_clock(column: Column) -> bool:
     """Return whether a column may hold the times of the samples.
 
     The result is True for dates and times of day that change within a recording. It is also True
-    for a column that is named like a clock (`time`, `stamp`, `t`, ...), if not all its cells are
-    numbers and they change within a recording, or if all are numbers that rise and it has no unit
-    of another quantity, like N. Numbers count as rising if they fall in at most 10 % of the steps,
-    like a counter that begins again, or in at least 90 %, if the newest row is the first. Raises
-    UnreadableError if cells are lists.
+    for a column that is named like a clock (`time`, `stamp`, `t`, ...) or has a unit of time, if
+    not all its cells are numbers and they change within a recording, or if all are numbers that
+    rise and it has no unit of another quantity, like N. Numbers count as rising if they fall in at
+    most 10 % of the steps, like a counter that begins again, or in at least 90 %, if the newest row
+    is the first. Raises UnreadableError if cells are lists.
     """
-    is_named = CLOCK_NAME.search(column.name)
+    is_named = CLOCK_NAME.search(column.name) or column.unit in UNITS
     if column.forms or (is_named and column.odd):
         return not column.fixed
     if not is_named or column.unit in QUANTITIES or not column.usual_step:
@@ -202,7 +202,7 @@ def form_of(column: Column, p: Proposal) -> str:
     elif match := NAMED_UNIT.search(column.name):
         units.append(str(match.lastgroup))
     for unit in units:
-        unit = unit.replace("sec", "s")
+        unit = re.sub("sec$", "s", unit)
         if unit.lstrip("0123456789. ") in UNITS:
             return unit
     return _unit_by_size(column, p)
@@ -275,7 +275,8 @@ def propose_rate(p: Proposal, tables: Tables) -> None:
             "time.rate_hz",
             UNKNOWN,
             f"{why}: is time.format right? If the newest row is the first, state time.sort=true. A "
-            "footer is left out with text.drop, the words that it begins with",
+            "footer is left out with text.drop, the words that it begins with. Below 1 Hz or above "
+            "1 MHz: time.column=[]",
         )
         return
     p.put("time.rate_hz", float(f"{1 / usual:.5g}"))

@@ -32,11 +32,12 @@ def layout_of(p: Proposal, files: Tables) -> str:
     which the first has one row, are `files` (a part in each), unless this row has 20 or more
     columns like `x0`, `x1`. Such columns (unless a clock with equal steps stands beside them, see
     `is_even_clock`), or lists of two items or more in the first row of the first table, make it
-    `wide` (a part in each row), or `npz` for an .npz file. It is `long` (a sample in each row) if a
-    column of the first table may tell the parts apart (`may_tell_parts`), or if a file has several
-    words in a stated `part.column`, the column that tells the parts apart. Several files, of which
-    `p.names` may have more than were looked at, are `files`. A single one gives `?`, with a note on
-    what to state.
+    `wide` (a part in each row), or `npz` for an .npz file; but if no header names the columns, so
+    that `x*` was made up, such columns give `?`, with a note. It is `long` (a sample in each row)
+    if a column of the first table may tell the parts apart (`may_tell_parts`), or if a file has
+    several words in a stated `part.column`, the column that tells the parts apart. Several files,
+    of which `p.names` may have more than were looked at, are `files`. A single one gives `?`, with
+    a note on what to state.
 
     For `long`, `part.column` is set in `p` (`_propose_part_column`). Raises DataError if the lists
     in 8 rows or more have fewer than 8 items, like the vectors of a force and a torque, and
@@ -47,7 +48,13 @@ def layout_of(p: Proposal, files: Tables) -> str:
     first = files[0]
     clocks = columns_of(files[:1], p.description.text).values()
     if numbered_columns(first) and not any(map(is_even_clock, clocks)):
-        return wide
+        if p.description.text.names != ("x*",):
+            return wide
+        p.notes["layout"] = (
+            "no header names the columns. wide: a part in each row; files: in each file; long: "
+            "state part.column"
+        )
+        return UNKNOWN
     if kind in OBJECTS and len(p.names) > 1 and len(first.lines) == 1:
         return "files"
     longest = longest_list(first)

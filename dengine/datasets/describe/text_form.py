@@ -43,7 +43,7 @@ HALF = 0.5  # a header has no more units among its names
 FRACTION = re.compile(r"-?\d+,0\d+|(?=.*[;\t|])(.*[;\t|])?\s*-?\d+,\d+\s*([;\t|].*)?")
 WHOLE = re.compile(r"-?\d+(\.0*)?(e\+00)?")
 UNIT_WORDS = re.compile(
-    r"(?i)[\[(]?(hh:mm(:ss)?|dd\.mm\.yyyy|[\d.]+ ?[mu]?s|[mun]?s(ecs?)?|min|h)[\])]?"
+    r"(?i)[\[(]?(hh:mm(:ss)?|dd\.mm\.yyyy|[\d.]+ ?[mu]?s|[mun]?s(ec(ond)?s?)?|min|h)[\])]?"
 )
 Rows = Sequence[Strings]
 
@@ -94,10 +94,11 @@ def look(content: bytes, stated: Stated) -> Look:
     data = _first_row(rows[:MOST_LINES], width)
     is_closed = not any(row[-1] for row in rows[data:] if len(row) == width)
     header, units = _head_lines(rows[:data], width - is_closed, stated)
-    beginning = stated.get("text.header", 0)
+    beginning = stated.get("text.header", header)
     if isinstance(beginning, str):
         found = (i for i, line in enumerate(lines[:data], 1) if line.startswith(beginning))
-        header = next(found, header)
+        beginning = next(found, header)
+    header = beginning
     form = TextForm(encoding, delimiter, header=header, units=units, data=data + 1)
     return Look(form, width, "".join(lines[header - 1 : header]), rows[data:], is_closed)
 
@@ -297,8 +298,10 @@ def _column_names(usual: Look) -> Strings:
     """Return the names of columns for `text.names`; empty if the header names each column.
 
     `#` or `%` at the beginning of the header is skipped. If it lacks the last column, and this is
-    empty in all rows, the names are those of the header and one like `column3`. Without a header,
-    or if it has another number of cells than there are columns, the names are `c0`, `c1`, ...; for
+    empty in all rows, the names are those of the header and one like `column3`. If it has one name
+    too many, like the `Comment` of LabVIEW, the last one is left out, unless a cell is a unit or
+    the delimiter a blank: then a name may stand in two cells. Without a header, or if it has
+    another number of cells than there are columns, the names are `c0`, `c1`, ...; for
     20 columns or more it is `x*`, which names all of them. Such a table may have a part in each
     row: if its first column has 2 to 12 different words, all whole numbers, it is named `class`,
     before `x*`.
@@ -311,6 +314,8 @@ def _column_names(usual: Look) -> Strings:
         return []
     if usual.is_closed and len(cells) == width - 1:
         return header_names([*cells, ""])
+    if len(cells) == width + 1 and usual.form.delimiter != BLANK and not any(map(is_unit, cells)):
+        return header_names(cells[:width])
     if width < MOST_NAMES:
         return [f"c{i}" for i in range(width)]
     firsts = {row[0] for row in usual.rows if row}

@@ -13,6 +13,8 @@ from ..units import bare
 UNITS = {  # in seconds
     "s": 1.0,
     "sec": 1.0,
+    "second": 1.0,
+    "Second": 1.0,
     "ms": 1e-3,
     "us": 1e-6,
     "µs": 1e-6,

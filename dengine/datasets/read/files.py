@@ -33,7 +33,19 @@ SUFFIXES = {
     ".db3": "mcap",
 }
 # Formats of recordings that other packages read.
-FOREIGN = (".npy", ".mat", ".h5", ".hdf5", ".tdms", ".bag", ".xlsx", ".xls", ".feather", ".pkl")
+FOREIGN = (
+    ".npy",
+    ".mat",
+    ".h5",
+    ".hdf5",
+    ".tdms",
+    ".bag",
+    ".xlsx",
+    ".xls",
+    ".feather",
+    ".pkl",
+    ".arff",
+)
 # Hidden files, pages for people, and descriptions.
 NO_RECORDING = re.compile(
     r"(?i)(^|/)(\.|(readme|licen[sc]e|notes|changelog)(\.[^/]*)?$|recordings\.toml$)"
@@ -128,7 +140,7 @@ def suffix_of(name: str) -> str:
 
 
 def names_in(root: Path, patterns: Strings) -> Strings:
-    """Return the files of a folder that may be recordings: relative paths, run_2 before run_10.
+    """Return the files of a folder that may be recordings, as relative paths, by their names.
 
     Hidden files, files in hidden folders or outside of the folder (`../x.csv`), `recordings.toml`,
     and files like README or LICENSE are left out. Without `patterns`, only files with a suffix of
@@ -143,7 +155,7 @@ def names_in(root: Path, patterns: Strings) -> Strings:
     names = match_files(root, patterns or ["**/*"])
     names -= {*filter(NO_RECORDING.search, names)}
     return sorted(
-        (n for n in names if patterns or suffix_of(n) in (*SUFFIXES, *FOREIGN)), key=natural_key
+        (n for n in names if patterns or suffix_of(n) in (*SUFFIXES, *FOREIGN)), key=file_key
     )
 
 
