@@ -45,10 +45,12 @@ QUALIFIER_NAME = re.compile(
 SIGNAL = re.compile(r"(?i)(force|kraft|torque|drehmoment|load|last)([_ ]?[xyz])?")
 WORD_BEGINS = r"(?i)(^|[^a-z]|(?-i:(?<=[a-z])(?=[A-Z])))"  # also in `forceUnit`
 SCALE_NAME = re.compile(
-    WORD_BEGINS + r"(unit(?!.*(serial|id|no|nr|under))|uom|einheit|scale|scaling"
+    WORD_BEGINS + r"(unit(?!.*(serial|id|no|nr|under))|uom|einheit|scale|scaling|teiler"
     r"|factor|faktor|gain|sensitivity|fs|dt|frequency|interval|takt"
     r"|(sampl\w*|abtast|scan|data|mess)[ _]?(rate|freq\w*))s?($|[^a-z])"
 )
+FACTOR_NAME = re.compile(r"(?i)scale(?!s)|scaling|factor|faktor|teiler|divisor")
+FACTOR = re.compile(r"(?!1([.,]0*)?$)[\d.,]+(e[-+]?\d+)?", re.IGNORECASE)  # not 1
 SET_VALUE = re.compile(
     WORD_BEGINS
     + r"(set|vorgabe|nominal|target|consigne|max|min|limit|(cmd|des|ref)(?![a-z])|comm?and"
@@ -250,9 +252,9 @@ def propose_channels(p: Proposal, units: Mapping[str, str]) -> None:
     It is the only likely one (`likely_channels`). The channels stay empty, with a note, if there is
     none or several, if the column is named like a set value, a limit or an error or stands for
     columns that are not numbered evenly, like `x0`, `x1`, `x5` (`_doubts_on`), or if a unit, a
-    factor of scale or a sampling rate that the recordings state differs between them
-    (`_other_scales`). Raises SettingError for a malformed `windows.trigger` (the condition at which
-    a part begins).
+    factor of scale or a sampling rate that the recordings state differs between them, or a factor
+    is not 1 (`_other_scales`). Raises SettingError for a malformed `windows.trigger` (the condition
+    at which a part begins).
 
     units : the columns that may be channels, with their units, "" for unknown.
     """
@@ -312,18 +314,21 @@ def _other_scales(p: Proposal) -> Iterator[str]:
     """Yield a text for each column or line above the header that shows that scales differ.
 
     It is named like a unit, a factor or a rate, or all its words are units, or numbers with one,
-    and come twice on average; its word is not the same in all recordings. Recordings in which it is
-    missing, empty or changes are ignored. The columns are those without a role (such as channel,
+    and come twice on average; its word is not the same in all recordings. If it is, a text comes
+    for a number other than 1 that is named like a factor. Recordings in which it is missing, empty
+    or changes are ignored. The columns are those without a role (such as channel,
     clock or label), and the lines are those of the first table. Raises SettingError for a malformed
     `windows.trigger`.
     """
     for source in sources_named(p, ANY_NAME, ANY_NAME):
         name = source.line or source.column[0]
-        words = part_words(source, p.tables).values()
+        words = [*part_words(source, p.tables).values()]
         n = len({*words})
         are_units = 2 * n <= len(words) and all(map(QUANTITY.fullmatch, words))
         if n > 1 and (are_units or SCALE_NAME.search(name)):
             yield f"{name} differs, {counts_of(words)}: convert them first, or state channels"
+        if n == 1 and FACTOR_NAME.search(name) and FACTOR.fullmatch(words[0]):
+            yield f"{name} is {words[0]}: if samples are multiplied by it, channels.COLUMN.factor"
 
 
 def may_be_channel(column: Column) -> bool:
