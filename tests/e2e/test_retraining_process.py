@@ -2,7 +2,6 @@
 
 import copy
 import logging
-import multiprocessing
 import os
 import signal
 import time
@@ -115,11 +114,6 @@ def test_a_process_that_died_or_hangs_is_started_again_and_no_change_waits_while
     accepted = [report.accepted for report in engine.store.versions.retrains()[3:]]
     assert (accepted, engine.version) == ([False, True], 4)
     assert len({*pids}) == 3
-
-
-def test_it_starts_and_ends_whatever_other_children_the_system_lists(monkeypatch):
-    monkeypatch.setattr(multiprocessing, "active_children", list)
-    RetrainingProcess().shutdown()
 
 
 def test_it_ends_with_whoever_made_it_also_at_work(process, running):
