@@ -251,7 +251,7 @@ class Recipe:
             return cls(name)
         raise SettingError(
             f"Expected a recipe among {', '.join(RECIPES)}, a TOML file, or module:Class of a "
-            f"reducer; {name[:200]} is none."
+            f"reducer; {name[:200]} is none, and no file."
         )
 
     @classmethod

@@ -105,13 +105,13 @@ def it_embeds_every_trace_in_every_space(reducer: Any) -> None:
         "in one space every label would be counted where it was seen"
     )
     Z = trained.embed(Q)
+    is_shaped = Z.ndim == 3 and Z.shape[:2] == (20, trained.n_spaces)
+    assert is_shaped, f"expected (n, K, d), 20 traces in {trained.n_spaces} spaces, got {Z.shape}"
     fold = np.arange(20) % trained.n_spaces
     assert_array_equal(
         _train_clone(reducer).embed(Q), Z, err_msg="two fits differ: give it a random_state"
     )
     assert_array_equal(trained.embed_references(Q, fold), Z[np.arange(20), fold])
-    is_shaped = Z.ndim == 3 and Z.shape[:2] == (20, trained.n_spaces)
-    assert is_shaped, f"expected (n, K, d), 20 traces in {trained.n_spaces} spaces, got {Z.shape}"
     assert Z.dtype == np.float32, f"expected float32, got {Z.dtype}"
     assert np.isfinite(Z).all(), "a point is not finite"
     shape = np.asarray(trained.transform(Q)).shape
@@ -146,19 +146,18 @@ def labels_come_only_where_it_says_that_it_uses_them(reducer: Any) -> None:
     """Assert that a reducer whose `fit` needs labels has `uses_labels = True`.
 
     A transformer that is no `Reducer` must have scikit-learn's tag `target_tags.required` instead.
-    Otherwise an engine would pass no labels, and every retrain would fail. A clone is trained on
-    test traces, so `reducer` stays unchanged. If the training fails although the reducer declares
-    that it uses labels, or fails with labels as well, the error of the training is raised
-    unchanged.
+    Otherwise an engine would pass no labels, and every retrain would fail. Clones are fitted to
+    test traces, so `reducer` stays unchanged. If `fit` fails with labels as well, its error is
+    raised unchanged.
     """
     X, y = toy_traces()
+    traces = X if isinstance(reducer, Reducer) else X[:, 0]
     try:
-        _train_clone(reducer)
+        clone(reducer).fit(traces)
     except Exception as error:
         if uses_labels(reducer):
-            raise
-        # If this fit fails as well, labels are not the reason, and its own error is raised.
-        clone(reducer).fit(X if isinstance(reducer, Reducer) else X[:, 0], y)
+            return
+        clone(reducer).fit(traces, y)  # if this fails as well, labels are not the reason
         raise AssertionError(
             f"its fit works with labels alone, got none; set uses_labels = True ({error})"
         ) from error

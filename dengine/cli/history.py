@@ -31,7 +31,6 @@ if TYPE_CHECKING:
     from ..store.records import Event, StoredDecision, StoredVersion
 
 SECONDS_OF = {"s": 1.0, "m": 60.0, "h": 3600.0, "d": 86400.0}
-TABLE_WIDTH = 120  # columns
 PART_LENGTH = 10  # characters of a part's number that are shown, its last
 SHORT_TIME = "%Y-%m-%d %H:%M:%S"
 NEIGHBOUR_FIELDS = ("decision_id", "part", "success", "source", "distance", "space", "inside")
@@ -206,8 +205,7 @@ def _history_table(items: Sequence[StoredDecision | StoredVersion | Event]) -> s
         columns.append([f"{text:{name[0]}{width}}" for text in texts])
     rows = ("  ".join(row).rstrip() for row in zip(*columns, strict=True))
     lines = (
-        next(rows) if isinstance(item, StoredDecision) else _event_line(item)[: TABLE_WIDTH - 1]
-        for item in items
+        next(rows) if isinstance(item, StoredDecision) else _event_line(item) for item in items
     )
     return "\n".join([next(rows), next(rows), *lines])
 

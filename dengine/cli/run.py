@@ -247,7 +247,8 @@ def _replay_cell(source: DataChoice, cycles: int, **others: Any) -> CellToDrive:
 
     A `TraceSpec` says what shape, rate and unit traces have. The recording is the data set of
     `source`, and is loaded at once. The function takes the engine, and returns the cell and its
-    name. The cell begins after the last part that was played before. A part was played before if
+    name. SettingError is raised for more `cycles` than parts. The cell begins after the last part
+    that was played before. A part was played before if
     its trace equals one that has a label of this cell in the store (but no label that a person
     withdrew, and no trace with a fault), or that of this cell's newest accepted part without a
     report. Making the cell raises SettingError if fewer parts than `cycles` are left, and
@@ -260,6 +261,7 @@ def _replay_cell(source: DataChoice, cycles: int, **others: Any) -> CellToDrive:
     from ..folds import content_hash
 
     dataset = source.load()
+    expect(cycles <= len(dataset), f"--cycles of at most {len(dataset)}", cycles)
 
     def make(engine: DataEngine) -> tuple[Cell, str]:
         """Return the parts after the last one that this engine's store knows as a robot cell, and
@@ -278,7 +280,7 @@ def _replay_cell(source: DataChoice, cycles: int, **others: Any) -> CellToDrive:
         n_left = len(dataset) - first
         expect(
             cycles <= n_left,
-            f"at most {n_left} cycles",
+            f"--cycles of at most {n_left}",
             cycles,
             f"{first} of {len(dataset)} parts were played before",
         )
@@ -291,22 +293,21 @@ def _replay_cell(source: DataChoice, cycles: int, **others: Any) -> CellToDrive:
 
 
 def _robot_cell(source: DataChoice, host: str | None, **others: Any) -> CellToDrive:
-    """Return the `TraceSpec` of a robot, and a function that connects to it and makes its cell.
+    """Connect to a robot; return its `TraceSpec`, and a function that returns its cell.
 
     A `TraceSpec` says what shape, rate and unit traces have. The robot is a Universal Robots
     controller at `host`, HOST or HOST:PORT. The options of `source` say what is recorded, and when;
     `others` are settings of other kinds of robot cell, and are ignored. The function takes the
-    engine, and returns the cell and its name. Nothing is connected before it is called. The cell's
-    `close` ends the connection.
+    engine, which it ignores, and returns the cell and its name. The cell's `close` ends the
+    connection. The robot comes first, because a store that is made for it keeps its settings.
 
     Raises
     ------
     SettingError
-        No host, a port that is no number, or values that no trace can have. Also raised by the
-        function, for a trigger or a channel that cannot be used.
+        No host, a port that is no number, values that no trace can have, or a trigger or a channel
+        that cannot be used.
     CellError
-        Raised by the function, when it makes the cell: the controller cannot be reached, or its
-        program is not ready in time.
+        The controller cannot be reached, or its program is not ready in time.
     """
     from ..cells.ur.cell import UrCell
 
@@ -317,7 +318,8 @@ def _robot_cell(source: DataChoice, host: str | None, **others: Any) -> CellToDr
     settings, spec = options.recorder_settings(source.options)
     settings |= options.drop_none(trigger=source.options.get("trigger"))
     name, port = host_and_port(host)
-    return spec, lambda engine: (UrCell(name, port=port, **settings), f"robot at {host}")
+    cell = UrCell(name, port=port, **settings)
+    return spec, lambda engine: (cell, f"robot at {host}")
 
 
 def host_and_port(address: str) -> tuple[str, int]:

@@ -144,7 +144,7 @@ def report(part: str, label: str, **changing: Any) -> None:
     _change_and_print(change, **changing)
 
 
-@verb("dengine correct engine.db import-d684ff7e4dbab839-0 bad")
+@verb("dengine correct engine.db import-d684ff7e4dbab839-0 good")
 @store_options
 @part_argument
 @label_argument
@@ -211,7 +211,7 @@ def release(**changing: Any) -> None:
     _change_and_print(lambda engine, author: engine.release(author), **changing)
 
 
-@verb("dengine policy engine.db --alpha 0.05 --lower-bound 0.95")
+@verb("dengine policy engine.db --alpha 0.1 --lower-bound 0.9")
 @store_options
 @options.bundle_options(
     "settings",

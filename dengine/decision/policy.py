@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal, Self, get_args
 
 from numpy.typing import ArrayLike
 
-from ..errors import SettingError, expect
+from ..errors import SettingError, expect, instead
 from ..imports import import_class
 from ..limits import ForceLimits
 from ..records import ACTIONS, Action, is_number, is_whole
@@ -300,12 +300,13 @@ class Policy:
         Raises
         ------
         SettingError
-            If the class cannot be imported, is no `DecisionRule`, or its constructor raises
-            TypeError, since it takes other arguments. Any other error of the constructor is raised
-            as it is.
+            If the class cannot be imported, is no `DecisionRule`, is the user's own and does not
+            compile to TorchScript, or its constructor raises TypeError, since it takes other
+            arguments. Any other error of the constructor is raised as it is.
         """
         from . import member_rules  # torch is imported where it is used
         from .rule import DecisionRule
+        from .scripting import script
 
         if self.guarantee in RULES:
             rule_class = getattr(member_rules, RULES[self.guarantee][self.stops])
@@ -326,6 +327,10 @@ class Policy:
             raise SettingError(
                 f"Expected {self.guarantee} to take alpha, lower_bound and interval: {error}."
             ) from error
+        if self.guarantee not in RULES:
+            wanted = f"Expected {self.guarantee} to compile, with a type for each argument"
+            with instead(SettingError, wanted, Exception):
+                script(rule)
         return rule
 
     def certificate(self, outcomes: Outcomes) -> Certificate:

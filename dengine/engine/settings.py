@@ -409,9 +409,9 @@ def check_imports(recipe: Recipe, store: str, allow_import: AllowedImports) -> N
     refused = [name for name in recipe.user_classes if name not in (allow_import or ())]
     if refused:
         raise ImportRefusedError(
-            f"Expected leave to import {shortened(refused[0])}, which {store} names: name it again "
-            "(reducer=, recipe=, policy=; --reducer, --guarantee), or allow it, where you trust "
-            "the store (allow_import=True; --allow-import)."
+            f"Expected leave to import {shortened(refused[0])}, which {store} names: allow it, "
+            "where you trust the store (allow_import=True; --allow-import), or name it again where "
+            "a reducer or a guarantee is stated."
         )
 
 

@@ -347,15 +347,19 @@ def _to_onnx(decision: OnnxDecision, spec: TraceSpec) -> Any:
 
     torch.export makes it, without TorchScript. Meanwhile Python's warnings, and log messages up to
     level WARNING, are off in the whole process, because torch reports optional packages that are
-    missing. Raises ExportError if torch makes no program; errors of torch are raised as they are.
+    missing. Raises ExportError if torch makes no program, for example because ONNX has no operator
+    for a layer of the user's network.
     """
     example = (torch.from_numpy(golden_trace(spec)),)
     level = logging.root.manager.disable
     logging.disable(logging.WARNING)
     try:
-        with warnings.catch_warnings():
+        with (
+            warnings.catch_warnings(),
+            instead(ExportError, "torch makes no ONNX program", Exception, do="export torchscript"),
+        ):
             warnings.simplefilter("ignore")
-            program = torch.onnx.export(
+            program: Any = torch.onnx.export(
                 decision,
                 example,
                 input_names=["trace"],
@@ -364,11 +368,9 @@ def _to_onnx(decision: OnnxDecision, spec: TraceSpec) -> Any:
                 opset_version=OPSET,
                 verbose=False,
             )
+            return program.model_proto
     finally:
         logging.disable(level)
-    if program is None:
-        raise ExportError("torch gave no ONNX program; export torchscript instead.")
-    return program.model_proto
 
 
 def _check_decisions(onnx_model: OnnxModel, model: Any, spec: TraceSpec) -> None:
@@ -407,4 +409,4 @@ def _require_packages() -> None:
     """
     missing = [needed for needed in NEEDED if find_spec(needed) is None]
     if missing:
-        raise ExportError(f"ONNX needs {', '.join(missing)}; pip install dengine[onnx].")
+        raise ExportError(f'ONNX needs {", ".join(missing)}; pip install "dengine[onnx]".')

@@ -404,8 +404,13 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
 
 
 def as_points(Z: Any) -> Floats:
-    """Return an embedding (n, d) as a contiguous float32 array; the same array if it is one."""
-    return np.ascontiguousarray(Z, dtype=np.float32)
+    """Return an embedding (n, d) as a contiguous float32 array; the same array if it is one.
+
+    Raises SettingError unless it has two axes.
+    """
+    points: Floats = np.ascontiguousarray(Z, dtype=np.float32)
+    expect(points.ndim == 2, "transform to give points (n, d)", points.shape)
+    return points
 
 
 def as_rows(traces: Floats) -> Floats:

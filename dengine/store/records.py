@@ -75,7 +75,7 @@ def unknown_decision(decision_id: str) -> UnknownDecisionError:
     """Return the error for the id of a decision that the store does not hold."""
     return UnknownDecisionError(
         f"Expected the id of a stored decision, got {shortened(decision_id)}, which this cell's "
-        "store does not hold; report the `Decision.id` that `decide` returned, to the same store "
+        "store does not hold; give the `Decision.id` that `decide` returned, to the same store "
         "and cell_id."
     )
 
@@ -105,9 +105,9 @@ def already_reported(
     )
     advice = "nothing more needs reporting"
     if first[0] is None:
-        advice = "if it is to count again, correct it"
+        advice = "if it is to count again, correct it (`dengine correct`)"
     elif first[0] != second[0]:
-        advice = "if the first was wrong, correct it"
+        advice = "if the first was wrong, correct it (`dengine correct`)"
     return ReportConflictError(
         f"Expected one report a decision, got a second on {decision_id!r}: {stored} was reported "
         f"first and stands, now came {new}; {advice}."

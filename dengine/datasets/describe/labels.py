@@ -310,7 +310,8 @@ def unmatched(p: Proposal, counted: Iterable[LabelSource]) -> Iterator[str]:
             keys = p.read_listing(source.listing).words(source.key)
             yield (
                 f"{source.listing} has {source.column}, but {source.key} names too few "
-                f"recordings: {listed(keys[:2])}; if a path contains the key, state part.path"
+                f"recordings: {listed(keys[:2])}; if a path contains the key, state it, as in "
+                f"{as_option('part.path', '([0-9]+)$')}"
             )
 
 

@@ -107,7 +107,7 @@ def as_source(source: Any) -> Any:
         f"Expected a file, a folder or a DataFrame, got {shortened(str(source))}",
         TypeError,
         *BAD,
-        do='"insertion" and arrays in memory take no description, and no key of one',
+        do='bundled sets, like "insertion", and arrays take no description, and no key of one',
     ):
         Path(source).stat()
         return Path(source)
