@@ -9,6 +9,7 @@ from importlib.resources import files
 
 TABLE = tomllib.loads((files("dengine") / "data" / "units.toml").read_text("utf-8"))
 OTHERS = TABLE.pop("others")["units"]
+TIME_UNITS: dict[str, float] = TABLE.pop("time")  # in seconds
 # Each unit with its quantity, like "force", and the factor to that quantity's first, like N. A unit
 # that is converted to no other, like `%` or `Hz`, is not here.
 UNITS: dict[str, tuple[str, float]] = {

@@ -12,10 +12,10 @@ from ...records import Floats
 from ..checks import check_forms
 from ..dataset import LEAST_RATE_HZ, MOST_RATE_HZ, Faults
 from ..description import ANY, UNKNOWN, TextForm, as_option
-from ..read.clock import UNITS, check_steps, has_day, scale_of, times_of
+from ..read.clock import check_steps, has_day, scale_of, times_of
 from ..read.files import caught
 from ..table import Table
-from ..units import UNITS as QUANTITIES
+from ..units import TIME_UNITS, UNITS
 from .columns import FORCES, Column, Proposal, Tables
 
 CLOCK_NAME = re.compile(
@@ -126,10 +126,10 @@ def is_clock(column: Column) -> bool:
     most 10 % of the steps, like a counter that begins again, or in at least 90 %, if the newest row
     is the first. Raises UnreadableError if cells are lists.
     """
-    is_named = CLOCK_NAME.search(column.name) or column.unit in UNITS
+    is_named = CLOCK_NAME.search(column.name) or column.unit in TIME_UNITS
     if column.forms or (is_named and column.odd):
         return not column.fixed
-    if not is_named or column.unit in QUANTITIES or not column.usual_step:
+    if not is_named or column.unit in UNITS or not column.usual_step:
         return False
     falls = (column.steps < 0).mean()
     return bool(min(falls, 1 - falls) <= FEW)
@@ -153,7 +153,7 @@ def is_counter(column: Column) -> bool:
     is_even = are_even(steps, usual)
     if COUNTER_NAME.fullmatch(column.name):
         return usual < 0 or not is_even
-    is_channel = column.unit in QUANTITIES or any(name.search(column.name) for name in FORCES)
+    is_channel = column.unit in UNITS or any(name.search(column.name) for name in FORCES)
     return is_even and usual not in (0, 1) and not is_channel and ANY not in column.name
 
 
@@ -203,7 +203,7 @@ def form_of(column: Column, p: Proposal) -> str:
         units.append(str(match.lastgroup))
     for unit in units:
         unit = re.sub("sec$", "s", unit)
-        if unit.lstrip("0123456789. ") in UNITS:
+        if unit.lstrip("0123456789. ") in TIME_UNITS:
             return unit
     return _unit_by_size(column, p)
 

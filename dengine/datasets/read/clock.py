@@ -8,23 +8,10 @@ from ...errors import DataError, instead
 from ...records import Floats
 from ..description import Clock, TextForm
 from ..table import Table, UnreadableError
-from ..units import bare
+from ..units import TIME_UNITS, bare
 
-UNITS = {  # in seconds
-    "s": 1.0,
-    "sec": 1.0,
-    "second": 1.0,
-    "Second": 1.0,
-    "ms": 1e-3,
-    "us": 1e-6,
-    "µs": 1e-6,
-    "ns": 1e-9,
-    "min": 60.0,
-    "h": 3600.0,
-    "d": 86400.0,
-}
 ISO = "iso"
-DAY = UNITS["d"]
+DAY = TIME_UNITS["d"]
 RATE_TOLERANCE = 0.03  # by which the rate of a recording's own times may differ from the stated one
 
 
@@ -51,12 +38,12 @@ def scale_of(unit: str) -> float:
     Raises DataError for any other text.
     """
     match = re.fullmatch(r"(\d+\.?\d*|\.\d+)?\s*([^\d.]+)", unit.strip())
-    if not match or match[2] not in UNITS:
+    if not match or match[2] not in TIME_UNITS:
         raise DataError(
-            f"Expected time.format to be a unit of time of {', '.join(UNITS)}, {ISO}, or a form "
-            f"like %d.%m.%Y, got {unit!r}."
+            f"Expected time.format to be a unit of time of {', '.join(TIME_UNITS)}, {ISO}, or a "
+            f"form like %d.%m.%Y, got {unit!r}."
         )
-    return float(match[1] or 1) * UNITS[match[2]]
+    return float(match[1] or 1) * TIME_UNITS[match[2]]
 
 
 def times_of(table: Table, clock: Clock, form: TextForm) -> Floats:
@@ -109,7 +96,7 @@ def times_of(table: Table, clock: Clock, form: TextForm) -> Floats:
             period = 0.0 if any(map(has_day, (unit, *clock.format))) else DAY
         else:
             own = bare(table.units.get(name, ""))  # in the file's row of units
-            scale = scale_of(own if own in UNITS else unit)
+            scale = scale_of(own if own in TIME_UNITS else unit)
             values = table.numbers(name, form) * scale
             table.refuse(np.isnan(values), "a time", name)
             period = clock.wrap * scale
