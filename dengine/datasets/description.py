@@ -517,20 +517,11 @@ class Description:
         return replace(self, channels={column: channels[column] for column in columns})
 
 
-# The sections, in the order of the file, and what their tables are made of; None: texts.
-SECTIONS: Values = {
-    "text": TextForm,
-    "rows": RowWords,
-    "time": Clock,
-    "channels": Channel,
-    "ignored": None,
-    "part": PartSource,
-    "label": LabelSource,
-    "check": LabelSource,
-    "windows": Windows,
-    "traces": TraceForm,
-    "seen": Seen,
-}
+# The sections, in the order of the file.
+SECTIONS = (
+    "text", "rows", "time", "channels", "ignored", "part", "label", "check", "windows", "traces",
+    "seen",
+)  # fmt: skip
 # Keys of which one states where a label or part number stands, and the others are cleared.
 SOURCES = ("column", "path", "line", "topic", "listing")
 # Keys of one column, whose name may have dots in it: `rows.Status of A.1.keep`.

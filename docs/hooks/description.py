@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import inspect
 import re
-from dataclasses import MISSING, fields
-from typing import Any
+from dataclasses import MISSING, fields, is_dataclass
+from typing import Any, get_args
 
 from dengine.datasets.description import SECTIONS, Description
 
@@ -22,8 +22,10 @@ def on_page_markdown(markdown: str, **others: Any) -> str:
 def keys() -> str:
     """Return a section for the keys at the top, and one for each section of the file."""
     text = ["## At the top\n", table(Description)]
-    for name, section in SECTIONS.items():
-        if section is not None:
+    types = {about.name: about.type for about in fields(Description)}
+    for name in SECTIONS:
+        # The section itself, or what a list or mapping holds; the texts of [ignored] have no keys.
+        for section in filter(is_dataclass, (types[name], *get_args(types[name]))):
             words = (section.__doc__ or "").split("\n")[0].partition(":")[0]
             text += [f"\n## [{TITLES.get(name, name)}]\n", f"{words}.\n", table(section)]
     return "\n".join(text)
