@@ -30,12 +30,12 @@ def cut(table: Table, description: Description, base: Path) -> Iterator[Table]:
     `path` of a part's table is the number of the part from 1, or its key in the listing. A part has
     `damage` (an error for which it is left out) if a trigger begins it in a gap of the times, or if
     a window of the listing has no samples, overlaps an earlier one, or goes beyond the recording.
-    If the labels are a topic of a ROS bag, that column has at most one cell: the first label
-    between the start of the part and the start of the next; different labels there are damage, too,
-    since a part may be missing. Raises DataError if `time.column` is
-    not stated, if a trigger cuts and the rate is not stated, if no part is found, if the recording
-    has damage, or if times, signals, labels or the listing cannot be read, SettingError for a
-    malformed trigger, and LookupError for a listing in an encoding that Python does not know.
+    If the labels are a topic of a ROS bag, that column has the different labels between the start
+    of the part and the start of the next: several, which are no label, may be those of two parts.
+    Raises DataError if `time.column` is not stated, if a trigger cuts and the rate is not stated,
+    if no part is found, if the recording has damage, or if times, signals, labels or the listing
+    cannot be read, SettingError for a malformed trigger, and LookupError for a listing in an
+    encoding that Python does not know.
     """
     import pandas as pd
 
@@ -43,20 +43,19 @@ def cut(table: Table, description: Description, base: Path) -> Iterator[Table]:
     if not description.time.column:
         raise DataError(f"Expected time.column, the clock of {name}, which is one long recording.")
     times = times_of(table.whole(), description.time, description.text)
-    find = _triggered if description.windows.trigger else _listed
-    windows = [*find(table, times, description, base)]
+    if description.windows.trigger:
+        windows = [*_triggered(table, times, description)]
+    else:
+        windows = [*_listed(times, description, base)]
     if not windows:
         raise DataError(f"Expected parts in {name}, found none; see [windows].")
     ends = [*(rows.start for _, rows, _ in windows[1:]), None]
     for (key, rows, fault), end in zip(windows, ends, strict=True):
         part = table.take(rows)
-        verdicts = {}
-        for topic in verdicts_of(description):
-            words = table.column(topic)[rows.start : end]
-            words = words[pd.notna(words)]
-            verdicts[topic] = words[:1]
-            if len({*words}) > 1:
-                fault = f"Expected one label in {topic} before the next part, got several"
+        verdicts = {
+            topic: pd.Series(table.column(topic)[rows.start : end]).dropna().unique()
+            for topic in verdicts_of(description)
+        }
         yield replace(
             part,
             source=f"{name}, {key}",
@@ -66,7 +65,7 @@ def cut(table: Table, description: Description, base: Path) -> Iterator[Table]:
         )
 
 
-def _triggered(table: Table, times: Floats, description: Description, base: Path) -> Windows:
+def _triggered(table: Table, times: Floats, description: Description) -> Windows:
     """Yield the number, the rows and the fault ("" for none) of each part that a trigger begins.
 
     A trigger is a condition on a signal, and a fault says why a part is left out. The numbers count
@@ -74,8 +73,8 @@ def _triggered(table: Table, times: Floats, description: Description, base: Path
     no fault here. A part has a fault if it begins in a gap of the times, 1.5 steps of the stated
     rate or more. A start within the previous part is ignored; a trigger that is on at the first
     row, or was off for fewer seconds than its `quiet_s`, is no start. `times`, shape (rows,), are
-    in seconds and increase; `base` is not used. Raises DataError if the rate is not stated or a
-    signal cannot be read, and SettingError for a malformed trigger.
+    in seconds and increase. Raises DataError if the rate is not stated or a signal cannot be read,
+    and SettingError for a malformed trigger.
     """
     rate = description.time.rate_hz
     if not rate:
@@ -94,7 +93,7 @@ def _triggered(table: Table, times: Floats, description: Description, base: Path
             yield str(number), slice(i, free), fault
 
 
-def _listed(table: Table, times: Floats, description: Description, base: Path) -> Windows:
+def _listed(times: Floats, description: Description, base: Path) -> Windows:
     """Yield the key, the rows and the fault ("" for none) of each window, by increasing start.
 
     The listing, a file in the folder `base`, has the key (the part's number), start and end of each
@@ -107,18 +106,18 @@ def _listed(table: Table, times: Floats, description: Description, base: Path) -
     and LookupError for an encoding that Python does not know.
     """
     about = description.windows
-    bounds = []
     with in_listing(about.listing):
         listing = listing_table(base / about.listing, description.text)
         keys = listing.words(about.key)
-        for column in (about.start, about.end):
-            clock = Clock((column,), (about.format,), description.time.zone)
-            bounds.append(times_of(listing, clock, description.text) - TOLERANCE)
-    zero = times[0] if bounds[1].max() < EPOCH <= times[0] else 0.0
-    begins, ends = np.array(bounds) + zero
+        clocks = (
+            Clock((column,), (about.format,), description.time.zone)
+            for column in (about.start, about.end)
+        )
+        begins, ends = (times_of(listing, clock, description.text) - TOLERANCE for clock in clocks)
+    zero = times[0] if ends.max() < EPOCH <= times[0] else 0.0
     margin = 1.5 / (description.time.rate_hz or np.inf) + TOLERANCE
     least = times[0] - margin
-    for begin, end, key in sorted(zip(begins, ends, keys.tolist(), strict=True)):
+    for begin, end, key in sorted(zip(begins + zero, ends + zero, keys.tolist(), strict=True)):
         rows = np.flatnonzero((times >= begin) & (times < end))
         fault = ""
         if not len(rows) or begin < least or end > times[-1] + margin:
