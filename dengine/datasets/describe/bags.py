@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..description import UNKNOWN, LabelSource
-from ..read.bags import LOG_TIME, STAMP, read_messages
+from ..read.bags import LOG_TIME, SECOND, STAMP, read_messages, stamp_of
 from ..table import Table, UnreadableError
 from .clock import propose_rate
 from .columns import Proposal, counts_of
@@ -61,7 +61,7 @@ def propose_bag(p: Proposal) -> None:
                 words[topic].append(str(message.data))
             elif len(times[topic]) == 1:
                 units |= _fields(message, topic)
-                is_stamped &= hasattr(message, "header") and message.header.stamp.sec > 0
+                is_stamped &= stamp_of(message) >= SECOND
     except UnreadableError:  # the messages before the damage are enough
         if not times:
             raise

@@ -25,6 +25,7 @@ from .split import signals_of, verdicts_of
 BAG = ".mcap"  # suffix
 STAMP = "stamp"
 LOG_TIME = "log_time"
+SECOND = 10**9  # in nanoseconds
 PLACE = "place"
 TOPIC = re.compile("/[^.]*")  # with a field behind a point it is a channel
 
@@ -119,7 +120,7 @@ def read_bag(
                     rows.append({LOG_TIME: logged, PLACE: places[topic], topic: message.data})
                 if topic in topics:
                     cells = {column: field(message) for column, field in fields.items()}
-                    rows.append({LOG_TIME: logged, PLACE: 1, STAMP: _stamp_of(message), **cells})
+                    rows.append({LOG_TIME: logged, PLACE: 1, STAMP: stamp_of(message), **cells})
     frame = pd.DataFrame(  # of objects: whole numbers stay whole
         rows, columns=[LOG_TIME, PLACE, STAMP, *fields, *places], dtype=object
     )
@@ -136,7 +137,7 @@ def read_bag(
     return replace(read_frame(frame[is_row], title), lines=[])
 
 
-def _stamp_of(message: Any) -> int:
+def stamp_of(message: Any) -> int:
     """Return the time in a message's header, in nanoseconds; 0 without a header."""
     stamp = getattr(getattr(message, "header", None), "stamp", None)
-    return stamp.sec * 10**9 + stamp.nanosec if stamp else 0
+    return stamp.sec * SECOND + stamp.nanosec if stamp else 0
