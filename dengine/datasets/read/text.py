@@ -63,7 +63,11 @@ def read_text(
     header = form.header
     above = 0
     if isinstance(header, str):
-        header = above = _header_line(content, header)
+        beginning = header.encode(errors="replace")
+        numbers = (i for i, line in enumerate(io.BytesIO(content), 1) if line.startswith(beginning))
+        header = above = next(numbers, 0)
+        if not above:
+            raise UnreadableError(f"Expected a header that begins with {form.header!r}, got none")
     first = form.data + above
     units = form.units and form.units + above
     end = content.rstrip(b"\n").count(b"\n") + 2
@@ -136,17 +140,6 @@ def header_names(cells: Strings) -> list[str]:
     names = [cell.strip() or f"column{i}" for i, cell in enumerate(cells, 1)]
     places = [names[: i + 1].count(name) for i, name in enumerate(names)]
     return [f"{name}.{n}" if n > 1 else name for name, n in zip(names, places, strict=True)]
-
-
-def _header_line(content: bytes, header: str) -> int:
-    """Return the number of the first line, from 1, that begins with a text, `header`.
-
-    `content` is the file in UTF-8. Raises UnreadableError if no line begins with the text.
-    """
-    for i, line in enumerate(io.BytesIO(content), 1):
-        if line.startswith(header.encode(errors="replace")):
-            return i
-    raise UnreadableError(f"Expected a header that begins with {header!r}, got none")
 
 
 def _names(top: Strings, header: int, form: TextForm) -> list[str]:
@@ -235,27 +228,26 @@ def _read_strictly(content: bytes, table: Table, form: TextForm) -> Table:
     all lines have a wrong number of cells.
     """
     n = len(table.columns)
-    rows = dict[int, list[str]]()
-    damage = list[UnreadableError]()
     lines = content.decode().split("\n")
     blanks = f" \t{form.delimiter}"  # all that a spreadsheet's empty rows at the end have
     while lines and not lines[-1].strip(blanks):
         lines.pop()
-    for i, line in enumerate(lines, 1):
-        if i >= table.lines[0] and line.strip() and not line.startswith(form.drop):
-            row = split_line(line, form.delimiter)
-            if len(row) != n:
-                damage.append(
-                    UnreadableError(
-                        f"Expected {n} cells, as there are columns, got {len(row)}; see text.drop",
-                        i,
-                    )
-                )
-                row = [""] * n
-            rows[i] = row
+    rows = {
+        i: split_line(line, form.delimiter)
+        for i, line in enumerate(lines, 1)
+        if i >= table.lines[0] and line.strip() and not line.startswith(form.drop)
+    }
+    damage = [
+        UnreadableError(
+            f"Expected {n} cells, as there are columns, got {len(row)}; see text.drop", i
+        )
+        for i, row in rows.items()
+        if len(row) != n
+    ]
     if damage and len(damage) == len(rows):
         raise damage[0]
-    cells = np.array([*rows.values()], dtype=object).reshape(-1, n).T
+    whole = [row if len(row) == n else [""] * n for row in rows.values()]
+    cells = np.array(whole, dtype=object).reshape(-1, n).T
     return replace(
         table,
         columns=dict(zip(table.columns, cells, strict=True)),
