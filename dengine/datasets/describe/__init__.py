@@ -125,20 +125,22 @@ def choose_files(p: Proposal, root: Path) -> bool:
             f"Expected files of recordings, {listed(SUFFIXES)}, in {root}, got none; state files "
             "for texts with another suffix, as in --set 'files=*.data'."
         )
-    endings = likely_endings(names)
-    expect_data(
-        bool(stated) or {*endings}.isdisjoint(FOREIGN),
-        f"files that dengine reads in {root}",
-        endings,
-        "state files, or see the page 'Recordings that dengine does not read'",
-    )
-    if len(endings) > 1 and not stated:
-        p.put("files", UNKNOWN, f"one of {listed(f'**/*{ending}' for ending in endings)}")
-        p.notes["channels"] = "they follow from files"
-        return False
+    if not stated:
+        endings = likely_endings(names)
+        expect_data(
+            {*endings}.isdisjoint(FOREIGN),
+            f"files that dengine reads in {root}",
+            endings,
+            "state files, or see the page 'Recordings that dengine does not read'",
+        )
+        if len(endings) > 1:
+            p.put("files", UNKNOWN, f"one of {listed(f'**/*{ending}' for ending in endings)}")
+            p.notes["channels"] = "they follow from files"
+            return False
+        names = [name for name in names if suffix_of(name) == endings[0]]
     p.base = root if root.is_dir() else root.parent
-    p.names = names if stated else [name for name in names if suffix_of(name) == endings[0]]
-    p.others = sorted({*names_in(root, ())}.difference(p.names), key=natural_key)
+    p.names = names
+    p.others = sorted({*names_in(root, ())}.difference(names), key=natural_key)
     p.put("files", globs(p.names))
     p.put("format", SUFFIXES.get(suffix_of(p.names[0]), "text"))
     return True

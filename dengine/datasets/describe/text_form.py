@@ -247,19 +247,18 @@ def propose_form(p: Proposal, contents: Mapping[str, bytes], faults: Faults) -> 
         [(forms[name], len(item.rows) * item.width) for name, item in looks.items()]
     )
     same = [name for name, form in forms.items() if form == usual]
-    odd = forms.keys() - same
-    p.set_aside(sorted(odd, key=natural_key))
-    odd -= p.description.listings
+    odd = sorted(forms.keys() - same, key=natural_key)
+    p.set_aside(odd)
+    odd = [name for name in odd if name not in p.description.listings]
     without_numbers = partial(DIGITS.sub, "0")
     if len({*map(forms.get, odd)}) < len(odd) or (
         {*map(without_numbers, odd)} & {*map(without_numbers, same)}
     ):
-        names = sorted(odd, key=natural_key)
         p.put(
             "exclude",
             UNKNOWN,
-            f"are {listed(names)} recordings of another form? If not, state a pattern, like "
-            f"{as_option('exclude', names[:2])}; if so, see files",
+            f"are {listed(odd)} recordings of another form? If not, state a pattern, like "
+            f"{as_option('exclude', odd[:2])}; if so, see files",
         )
     _propose_keys(p, [looks[name] for name in same])
     return same
