@@ -95,7 +95,7 @@ def with_meanings(source: LabelSource, words: Names) -> LabelSource:
     groups: Sequence[Sequence[str]] = (GOOD, BAD, UNCHECKED)
     if lists_words(source) or GOOD_NAME.fullmatch(name):
         groups = ((*GOOD, *YES), (*BAD, *NO), UNCHECKED)
-    free = sorted({*words}.difference(source.good, source.bad, source.unchecked))
+    free = sorted({*words}.difference(source.meanings))
     goods, bads, others = (tuple(w for w in free if w.lower() in group) for group in groups)
     return replace(
         source,
@@ -136,12 +136,11 @@ def is_named_like_verdict(source: LabelSource) -> bool:
     """Return whether a source of labels has the name of a verdict, like `result`.
 
     This is the name of its column, or the beginning of its line. A path counts if its regular
-    expression lists words, like `(ok|nok)`, but not if it takes any word. A source without column,
-    line and path counts.
+    expression lists words, like `(ok|nok)`, but not if it takes any word.
     """
-    name = source.column or source.line
-    is_named = not name or VERDICT_NAME.fullmatch(name) is not None
-    return is_named and (not source.path or lists_words(source))
+    if source.path:
+        return lists_words(source)
+    return VERDICT_NAME.fullmatch(source.column or source.line) is not None
 
 
 def may_be_labels(source: LabelSource, words: Collection[str]) -> bool:
@@ -299,10 +298,8 @@ def unmatched(p: Proposal, counted: Iterable[LabelSource]) -> Iterator[str]:
     `counted` are the sources of labels for recordings of `p`; a listing that has a word for half of
     them or fewer is not among these, also if its rows with one key have different words. A listing
     is a file with a row for each recording or part, and its verdict a column that is named like
-    one. If the user stated a source, nothing is yielded. Raises what `sources_of` raises.
+    one. Raises what `sources_of` raises.
     """
-    if place_of(p.description.label):
-        return
     listings = {source.listing for source in counted}
     for source in sources_of(p, ()):
         if source.listing and source.listing not in listings and is_named_like_verdict(source):
@@ -374,7 +371,7 @@ def doubt_among(named: Sequence[LabelSource], counted: Counted) -> str:
     `counted` if the words of any mean only good, bad or not checked (`is_known`). Sources that have
     the same word for each recording count as one.
     """
-    has_known = any(is_known(source, words) for source, words in counted.items())
+    has_known = any(map(is_known, counted, counted.values()))
     rivals = {tuple(counted[source].items()) for source in (counted if has_known else named)}
     if len(rivals) == 1 and named:
         return ""
@@ -407,9 +404,12 @@ def propose_label(p: Proposal) -> None:
     label = p.description.label
     stated = [label] if place_of(label) else []
     counted = count_sources(p, stated)
-    named = [*counted] if stated else [*filter(is_named_like_verdict, counted)]
+    named = [*counted]
+    strays: Strings = []
+    if not stated:
+        named = [*filter(is_named_like_verdict, counted)]
+        strays = [*unmatched(p, counted)]
     certain = [s for s in named if is_known(s, counted[s]) and UNKNOWN not in s.good + s.bad]
-    strays = [*unmatched(p, counted)]
     doubt = doubt_on(certain[0], counted, strays) if certain else doubt_among(named, counted)
     if doubt:
         p.put(
