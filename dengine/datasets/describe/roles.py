@@ -174,33 +174,26 @@ def may_qualify(column: Column, n_rows: int) -> bool:
     """Return whether the words of a column may tell which rows are samples.
 
     It must have a cell in each of the `n_rows` rows of all recordings, or a single one for each
-    recording that has the column. It must be a status (`is_status`), or have 1 to 12 different
-    texts, perhaps beside numbers, like `Max` in a footer, and no times, and it must change within a
-    recording. If it does not, there must be several words, of which one names a force or a torque,
-    or it must be named like a status (`Status`, `valid`), a unit, a factor or a rate and have just
-    one word in all: recordings with another one become faults.
+    recording that has the column. It must change within a recording, and be a status (`is_status`),
+    have 1 to 12 different texts, perhaps beside numbers, like `Max` in a footer, and no times, or
+    number the phases of a cycle: 2 to 12 different numbers in steps of whole numbers, with no empty
+    cell and no unit. If it does not change, there must be several words, of which one names a force
+    or a torque, or it must be named like a status (`Status`, `valid`), a unit, a factor or a rate
+    and have just one word in all: recordings with another one become faults.
     """
     words = column.counts
-    is_text = 0 < len(texts_of(column)) <= MOST_WORDS
-    is_time = column.forms or CLOCK_NAME.search(column.name)
     if words.total() not in (n_rows, len(column.fixed)):
         return False
     if not column.fixed:
-        return is_status(column) or is_phase(column) or (is_text and not is_time)
+        is_text = 0 < len(texts_of(column)) <= MOST_WORDS
+        is_time = column.forms or CLOCK_NAME.search(column.name)
+        is_phase = 1 < len(words) <= MOST_WORDS and not (
+            column.odd or column.unit or (column.steps % 1).any()
+        )
+        return is_status(column) or is_phase or (is_text and not is_time)
     if len(words) > 1:
         return any(map(SIGNAL.fullmatch, words))
     return bool(QUALIFIER_NAME.search(column.name) or SCALE_NAME.search(column.name))
-
-
-def is_phase(column: Column) -> bool:
-    """Return whether a column may number the phases of a cycle: it has 2 to 12 different numbers.
-
-    They change within a recording, in steps of whole numbers; no cell is empty or a text, and the
-    column has no unit.
-    """
-    return 1 < len(column.counts) <= MOST_WORDS and not (
-        column.odd or column.fixed or column.unit or (column.steps % 1).any()
-    )
 
 
 def sources_named(p: Proposal, column: re.Pattern[str], line: re.Pattern[str]) -> list[PartSource]:
