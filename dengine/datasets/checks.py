@@ -91,10 +91,9 @@ def without_repeats(recordings: Sequence[Recording]) -> tuple[list[Recording], F
     labels differ, none is kept. This also holds for traces of a dead sensor (all samples are
     equal), although the engine never trains on them.
     """
-    traces = [recording.trace for recording in recordings]
-    hashes = content_hash(np.stack(traces)).tolist() if traces else []
+    hashes = content_hash(np.array([recording.trace for recording in recordings]))
     groups = defaultdict[int, list[Recording]](list)
-    for hash_, recording in zip(hashes, recordings, strict=True):
+    for hash_, recording in zip(hashes.tolist(), recordings, strict=True):
         groups[hash_].append(recording)
     kept = list[Recording]()
     faults: Faults = []

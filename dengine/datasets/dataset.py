@@ -24,7 +24,6 @@ Texts = NDArray[np.str_]
 Names = tuple[str, ...]
 Progress = Callable[[int], None]  # called with the number of files or traces that are done
 OWN = "dengine"  # key of the metadata by which a table of ours is known
-ABOUT = ("channels", "rate_hz", "unit", "limit", "fit")  # what it says
 expect_data = partial(expect, error=DataError)
 
 
@@ -185,10 +184,10 @@ class Dataset:
         for name, values in (("cause", self.cause), ("part", self.part), ("label", self.y)):
             if values is not None:
                 frame.insert(0, name, values)
-        frame.attrs[OWN] = {name: getattr(self, name) for name in ABOUT} | {
-            "n_channels": channels,
-            "columns": names,
+        about = {
+            name: getattr(self, name) for name in ("channels", "rate_hz", "unit", "limit", "fit")
         }
+        frame.attrs[OWN] = {**about, "n_channels": channels, "columns": names}
         return frame
 
     def select(self, channels: Names) -> "Dataset":

@@ -36,10 +36,9 @@ from ..records import (
 from ..store.opening import LONG_WAIT, opening
 from ..store.records import NewLabel, StoredDecision
 from ..traces import TraceGate, as_traces
-from . import Dataset, load_dataset
-from .dataset import Progress
+from .dataset import Dataset, Progress
 from .description import Description
-from .loading import description_of, own_reader
+from .loading import description_of, load_dataset, own_reader
 
 if TYPE_CHECKING:
     from ..store.opening import StoreLike
@@ -83,9 +82,9 @@ def check_agreement(data: Dataset, trace_spec: TraceSpec) -> None:
     not compared. Raises SettingError if no `TraceSpec` can be made of the data set (`data.spec`).
     """
     spec = data.spec
-    forms = [(form.fit == "resample", form.samples) for form in (spec, trace_spec)]
+    fits_agree = (spec.fit == "resample") == (trace_spec.fit == "resample")
     expect(
-        data.lengths is None or forms[0] == forms[1],
+        data.lengths is None or (spec.samples == trace_spec.samples and fits_agree),
         f"recordings brought to {trace_spec.samples} samples by {trace_spec.fit}",
         (spec.samples, spec.fit),
         "state these in [traces], or what is known would count again",

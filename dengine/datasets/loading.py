@@ -288,7 +288,7 @@ def _read_npz(path: Path) -> Dataset:
         path, ("X", "y", "scale", "rate_hz", "unit", "cause", "channels", "part")
     )
     with read_errors(path, "an .npz file of plain arrays"):
-        X = arrays["X"] * arrays.get("scale", np.ones(1)).astype(np.float32)
+        X = arrays["X"] * np.float32(arrays.get("scale", 1.0))
         units, channels = (
             [*map(str, np.atleast_1d(arrays.get(key, ())).tolist())] for key in ("unit", "channels")
         )

@@ -152,10 +152,14 @@ def names_in(root: Path, patterns: Strings) -> Strings:
     """
     if root.is_file():
         return [root.name]
-    names = match_files(root, patterns or ["**/*"])
-    names -= {*filter(NO_RECORDING.search, names)}
     return sorted(
-        (n for n in names if patterns or suffix_of(n) in (*SUFFIXES, *FOREIGN)), key=file_key
+        (
+            name
+            for name in match_files(root, patterns or ["**/*"])
+            if not NO_RECORDING.search(name)
+            and (patterns or suffix_of(name) in (*SUFFIXES, *FOREIGN))
+        ),
+        key=file_key,
     )
 
 
@@ -189,8 +193,8 @@ def unread_note(source: Any, description: Description) -> str:
     """
     if not isinstance(source, Path) or source.is_file():
         return ""
-    known = match_files(source, (*description.files, *description.exclude))
-    others = [n for n in names_in(source, ()) if n not in known | description.listings]
+    known = match_files(source, (*description.files, *description.exclude)) | description.listings
+    others = [name for name in names_in(source, ()) if name not in known]
     return f"Not read, for neither files nor exclude has them: {listed(others)}." if others else ""
 
 

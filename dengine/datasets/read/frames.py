@@ -143,9 +143,8 @@ def read_frame(frame: Any, source: str) -> Table:
     frame = frame.reset_index(drop=is_plain)
     columns = {}
     for name, cells in frame.items():
-        if cells.hasnans and not isinstance(cells.dtype, np.dtype):  # it has pandas' NA
-            cells = cells.astype(object).where(cells.notna(), None)
-        columns[str(name)] = cells.to_numpy()
+        has_na = cells.hasnans and not isinstance(cells.dtype, np.dtype)  # pandas' own NA
+        columns[str(name)] = cells.to_numpy(object, na_value=None) if has_na else cells.to_numpy()
     return Table(source, columns, np.arange(1, len(frame) + 1))
 
 

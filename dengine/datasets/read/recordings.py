@@ -390,7 +390,7 @@ def fitted(samples: Floats, seconds: Floats | None, description: Description) ->
         times = np.arange(about.samples) / rate
         wrong += f", which last {seconds[-1]:.4g} s and not {times[-1]:.4g} s"
         if times[-1] <= seconds[-1] + (1 + ROUNDING) / rate:
-            return np.stack([np.interp(times, seconds, row) for row in samples]).astype(np.float32)
+            return np.array([np.interp(times, seconds, row) for row in samples], np.float32)
     elif can_fit:
         return fit_length(torch.from_numpy(samples.astype(np.float32)), about.samples, kind).numpy()
     raise UnreadableError(f"{wrong}; see traces.lengths, which is {about.lengths}")
