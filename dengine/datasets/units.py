@@ -1,4 +1,5 @@
-"""Units of measurement: which stand for the same quantity, and the factor from one to another.
+"""Units of measurement: which stand for the same quantity, the factor from one to another, and the
+units of times.
 
 They are listed in `dengine/data/units.toml`.
 """
@@ -31,9 +32,10 @@ def is_load(unit: str) -> bool:
 
 
 def is_unit(text: str) -> bool:
-    """Return whether a text is a unit of this table, with or without brackets.
+    """Return whether a text is a unit of samples, with or without brackets.
 
-    Units that are converted to no other, like `%`, count. Capital and small letters differ.
+    Units that are converted to no other, like `%`, count, those of times do not. Capital and small
+    letters differ.
     """
     return bare(text) in OTHERS or bare(text) in UNITS
 
@@ -56,7 +58,7 @@ def conversion(unit: str, wanted: str) -> float | None:
 def unit_in(name: str) -> str:
     """Return the unit at the end of a column's name, as in `Kraft [N]` or `F_kN`; "" if none.
 
-    It must be a unit in `units.toml`, in brackets, or behind `in`, `/`, `_` or `..`, and is
+    It must be a unit of samples (`is_unit`), in brackets, or behind `in`, `/`, `_` or `..`, and is
     returned without them; a point or `_` behind it (`Force..N.`, `Force_N_`) is left out. What is
     in brackets or behind `in` counts as a whole: `Force [N/mm]` has none. Behind `/` or `_`
     neither `in` is one (`Force_in` may be an input) nor a single character but N (`Fz_W` is a force
