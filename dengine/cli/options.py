@@ -164,7 +164,8 @@ def bundle_options(into: str, make: Callable[..., Any], options: Mapping[str, Op
     """Return a decorator that adds options and hands them to the subcommand as one argument.
 
     The subcommand's other arguments, passed by name, reach it unchanged. The help lists the options
-    in their order in `options`. What `make` raises is raised before the subcommand begins.
+    in their order in `options`. What `make` raises is raised before the subcommand begins. Options
+    that were not given and have no default are left out; False, 0 and "" were given.
 
     Parameters
     ----------
@@ -181,7 +182,7 @@ def bundle_options(into: str, make: Callable[..., Any], options: Mapping[str, Op
 
         @wraps(command)
         def bundled(**values: Any) -> Any:
-            taken = {name: values.pop(name) for name in options}
+            taken = {k: value for k in options if (value := values.pop(k)) is not None}
             return command(**{into: make(**taken)}, **values)
 
         decorated: Command = bundled
@@ -192,15 +193,9 @@ def bundle_options(into: str, make: Callable[..., Any], options: Mapping[str, Op
     return decorate
 
 
-def drop_none(**values: Any) -> Values:
-    """Return the options that were given, by name: those whose value is not None.
-
-    False, 0 and "" were given, too.
-    """
-    return {name: value for name, value in values.items() if value is not None}
-
-
-def _address(store: str | None, cell_id: str | None, product: str | None = None) -> str | None:
+def _address(
+    store: str | None = None, cell_id: str | None = None, product: str | None = None
+) -> str | None:
     """Return a store's address: its file or URL, or a `CellAddress` that also names a robot cell.
 
     It is a `CellAddress` if a robot cell or a product (the kind of part that several cells make) is
@@ -444,9 +439,9 @@ RECIPE = {
 }
 
 
-policy_options = bundle_options("settings", drop_none, SETTINGS)
+policy_options = bundle_options("settings", dict, SETTINGS)
 recipe_options = bundle_options(
-    "choice", lambda name, **given: RecipeChoice(name, drop_none(**given)), RECIPE | SETTINGS
+    "choice", lambda name=None, **given: RecipeChoice(name, given), RECIPE | SETTINGS
 )
 
 
@@ -699,8 +694,8 @@ def data_options(
     more = LIVE | TRIGGER if live else {}
     return bundle_options(
         "source",
-        lambda data, description, stated, **given: DataChoice(
-            data, description, parse_stated(stated), drop_none(**given)
+        lambda data, stated, description=None, **given: DataChoice(
+            data, description, parse_stated(stated), given
         ),
         {"data": data} | DATA | more,
     )
@@ -834,7 +829,7 @@ def out_option(
     help of `--out`.
     """
 
-    def make_out(out: Path | None, force: bool) -> Out | None:
+    def make_out(force: bool, out: Path | None = None) -> Out | None:
         """Return the `Out`, None without `--out`; OutputError if one of the files `names` must not
         be written. Nothing is created.
         """

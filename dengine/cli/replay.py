@@ -61,21 +61,21 @@ class Stream:
     ----------
     seeds : range
         Each gives a replay of every contender and policy.
-    cycles : int or None
-        Parts of a replay; None: all.
     shuffle : bool
         Whether the parts are shuffled, by the seed; False: in recorded order.
     n_jobs : int
         Replays at a time, as joblib counts them.
+    cycles : int or None
+        Parts of a replay; None: all.
     keep : Path or None
         Folder of finished replays, which are read from there and not played again.
     """
 
     seeds: range
-    cycles: int | None
     shuffle: bool
     n_jobs: int
-    keep: Path | None
+    cycles: int | None = None
+    keep: Path | None = None
 
 
 def _play(
@@ -241,7 +241,7 @@ def replay(choice: RecipeChoice, **played: Any) -> None:
 @click.option(
     "--paper", is_flag=True, help="The paper's whole grid: 3 alphas, 3 lower bounds, 2 intervals."
 )
-@options.bundle_options("lists", options.drop_none, POLICY_LISTS)
+@options.bundle_options("lists", dict, POLICY_LISTS)
 @stream_options(30, 1, 1, _SHUFFLES)
 @options.check_option
 @explain_option
@@ -489,7 +489,7 @@ PRICES = {
 @options.bundle_options("part_prices", dict, PRICES)
 @click.option("--cost-unit", default="s", help="Unit of these costs: s, EUR, ...")
 @options.recipe_options
-@options.bundle_options("lists", options.drop_none, GRID_LISTS)
+@options.bundle_options("lists", dict, GRID_LISTS)
 @stream_options(
     4,
     2,

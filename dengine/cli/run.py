@@ -316,7 +316,8 @@ def _robot_cell(source: DataChoice, host: str | None, **others: Any) -> CellToDr
             "Expected the robot's address for --cell ur, as in --host 192.168.1.10, got none."
         )
     settings, spec = options.recorder_settings(source.options)
-    settings |= options.drop_none(trigger=source.options.get("trigger"))
+    if "trigger" in source.options:
+        settings["trigger"] = source.options["trigger"]
     name, port = host_and_port(host)
     cell = UrCell(name, port=port, **settings)
     return spec, lambda engine: (cell, f"robot at {host}")

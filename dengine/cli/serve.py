@@ -63,7 +63,7 @@ DEMO_DEADLINE = 5.0
     help="Seconds that a decision may wait in line; after that it is recorded as verify.",
 )
 @options.check_option
-@options.bundle_options("trace_options", options.drop_none, TRACE)
+@options.bundle_options("trace_options", dict, TRACE)
 @options.verify_all_option
 @click.option(
     "--opcua",

@@ -215,7 +215,7 @@ def release(**changing: Any) -> None:
 @store_options
 @options.bundle_options(
     "settings",
-    options.drop_none,
+    dict,
     POLICY | {"interval": interval_option, "shadow": shadow_option},
 )
 def policy(store: str, settings: dict[str, Any], author: str, allow_import: bool) -> None:

@@ -184,12 +184,12 @@ def test_run_verifies_less_in_the_end_and_resumes_after_its_last_part(data, tmp_
     assert n_rows(tmp_path / "run.csv") == 110
     assert "resumed" in document(*words, "--reducer", "pca", "--cycles", 30)["title"]
     # Only what was typed is named.
-    assert "got alpha 0.01; leave them out" in refused(*words, "--alpha", 0.01)
+    assert "got alpha 0.01; leave them out" in refused(*words, "--alpha", 0.01, "--cycles", 9)
     with DataEngine.open(store) as engine:
         assert engine.status().ever.decisions == 140
         hashes = engine.store.labels.with_traces().hashes.tolist()
     assert len(hashes) == len({*hashes})
-    assert re.search(r"at most 2\d cycles, got 60", refused(*words, "--cycles", 60))
+    assert re.search(r"--cycles of at most 2\d, got 60", refused(*words, "--cycles", 60))
 
 
 def test_a_table_prints_every_text_as_it_is_and_cuts_none(capsys):

@@ -80,7 +80,7 @@ def test_what_the_twin_cannot_do_is_refused(data, tmp_path, monkeypatch):
             with pytest.raises(ExportError, match=why):
                 export_onnx(model, tmp_path / "model.onnx")
     monkeypatch.setattr("dengine.export.onnx.find_spec", lambda name: name != "onnxscript" or None)
-    with pytest.raises(ExportError, match=r"needs onnxscript; pip install dengine\[onnx\]"):
+    with pytest.raises(ExportError, match=r'needs onnxscript; pip install "dengine\[onnx\]"'):
         export_onnx(fitted(data), tmp_path / "model.onnx")
     assert not any(tmp_path.iterdir())
 

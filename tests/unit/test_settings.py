@@ -216,7 +216,7 @@ def test_what_a_store_names_is_imported_only_where_its_caller_says_so(
 
     assert exit_codes("status {}", "verify {}", "history {}", "explain {} last") == [0] * 4
     assert exit_codes("retrain {}", "policy {}") == [2] * 2
-    match = r"theirs:.*, which .* names: name it again .*allow_import=True"
+    match = r"theirs:.*, which .* names: allow it, .*allow_import=True"
     with pytest.raises(ImportRefusedError, match=match):
         DataEngine.open(address(url, "a"))
     with pytest.raises(ImportRefusedError, match=r"theirs:.*, which a peer"):
