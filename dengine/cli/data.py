@@ -86,7 +86,7 @@ def data(
         path = description.save(source.path, force) if save else None
         _print_open_keys(source, description, path)
         context.exit(int(check))
-    dataset = source.load(description)
+    dataset = source.load(description, quiet=True)
     survey = survey_dataset(dataset)
     path = None
     shown = ""

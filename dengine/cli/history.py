@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from ..history.explain import Explanation
     from ..store.records import Event, StoredDecision, StoredVersion
 
+TABLE_WIDTH = 120  # columns
 SECONDS_OF = {"s": 1.0, "m": 60.0, "h": 3600.0, "d": 86400.0}
 PART_LENGTH = 10  # characters of a part's number that are shown, its last
 SHORT_TIME = "%Y-%m-%d %H:%M:%S"
@@ -215,17 +216,23 @@ def _event_line(item: StoredVersion | Event) -> str:
 
     The line of a retrain also has the number of traces and the duration; it names the version of
     the model that came into use, or, if the retrain was dropped (its model is not used), the number
-    of the retrain. The text of an event is put on one line.
+    of the retrain. The text of an event is put on one line. "..." ends a line that is cut, at 120
+    characters.
     """
     from ..store.records import Event
 
     time_text = format_time(item.time, SHORT_TIME)
     if isinstance(item, Event):
-        return f"{time_text}  * {item.kind}: {' '.join(item.text.split())}"
-    report = item.report
-    title = f"retrain to version {report.version}" if report.accepted else f"retrain {item.number}"
-    duration = format_duration(report.seconds)
-    return f"{time_text}  * {title}, {report.n_traces} traces, {duration}: {report.reason}"
+        text = f"{item.kind}: {' '.join(item.text.split())}"
+    else:
+        report = item.report
+        title = f"retrain {item.number}"
+        if report.accepted:
+            title = f"retrain to version {report.version}"
+        duration = format_duration(report.seconds)
+        text = f"{title}, {report.n_traces} traces, {duration}: {report.reason}"
+    line = f"{time_text}  * {text}"
+    return line if len(line) <= TABLE_WIDTH else f"{line[: TABLE_WIDTH - 3]}..."
 
 
 @verb("dengine explain engine.db last --out why.png")

@@ -507,14 +507,14 @@ class DataChoice:
         with progress_bar(f"describing {self.data}", None):
             return description_of(self.data, self.description, self.stated, propose)
 
-    def load(self, description: Description | None = None) -> Dataset:
+    def load(self, description: Description | None = None, quiet: bool = False) -> Dataset:
         """Load the data set, with a progress bar, and return it.
 
         It has only the channels and samples that the options `--channels` and `--samples` ask for.
         Its `notes`, and the first three recordings that were left out, are printed to stderr, but
-        not with `--json`. `description` says how recordings are read; None takes the one that
-        `describe` returns. A damaged trace of a store is left out, and an event in the store's log
-        says so.
+        not with `--json` or if `quiet`. `description` says how recordings are read; None takes the
+        one that `describe` returns. A damaged trace of a store is left out, and an event in the
+        store's log says so.
 
         Raises
         ------
@@ -544,7 +544,7 @@ class DataChoice:
                 samples=self.options.get("samples"),
                 progress=advance,
             )
-        if not as_json():
+        if not (quiet or as_json()):
             for line in (*map(as_options, data.notes), *fault_lines(data, 3)):
                 click.echo(line, err=True)
         return data
