@@ -95,6 +95,31 @@ class Verbs(click.Group):
 
 @click.group(
     cls=Verbs,
+    commands=[
+        data,
+        replay,
+        compare,
+        costs,
+        train,
+        run,
+        serve,
+        simulate,
+        status,
+        history,
+        explain,
+        verify,
+        report,
+        correct,
+        forget,
+        rollback,
+        release,
+        policy,
+        retrain,
+        backup,
+        restore,
+        export,
+        import_labels,
+    ],
     context_settings={"help_option_names": ["-h", "--help"], "show_default": True},
     epilog=example_epilog("dengine replay --data insertion --reducer conv --repeats 3"),
 )
@@ -105,11 +130,3 @@ def main() -> None:
     Exit codes: 0 success; 1 failure, with one line that says why; 2 wrong usage; 130 interrupted by
     Ctrl-C, and what was done until then is kept and shown.
     """
-
-
-for command in (
-    *(data, replay, compare, costs, train, run, serve, simulate, status, history, explain, verify),
-    *(report, correct, forget, rollback, release, policy, retrain, backup, restore, export),
-    import_labels,
-):
-    main.add_command(command)

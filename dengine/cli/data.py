@@ -23,7 +23,7 @@ from .output import (
 )
 
 if TYPE_CHECKING:
-    from ..datasets import Dataset, Description
+    from ..datasets import Dataset
     from ..experiments.survey import Survey
 
 MOST_FAULTS = 10  # that are shown
@@ -84,29 +84,37 @@ def data(
     description = source.describe(propose=True)
     if description is not None and description.open_keys:
         path = description.save(source.path, force) if save else None
-        _print_open_keys(source, description, path)
+        text = description.to_toml()
+        print_result(
+            {"data": source.data, "description": text, "open": description.open_keys},
+            text,
+            f"Wrote {path}." if path else "",
+            "Still open, so nothing was read; state each with --set KEY=VALUE:",
+            *(
+                f"- {key}: {description.notes.get(key, 'not known')}"
+                for key in description.open_keys
+            ),
+        )
         context.exit(int(check))
     dataset = source.load(description, quiet=True)
     survey = survey_dataset(dataset)
-    path = None
     shown = ""
-    if description is not None:
-        seen = Seen(
-            recordings=len(dataset) + dataset.unlabelled + len(dataset.faults),
-            good=survey.good,
-            bad=survey.bad,
-        )
-        if save:
-            path = replace(description, seen=seen).save(source.path, force)
-        shown = description.to_toml()
     last_line = ""
-    if path is not None:
-        last_line = f"Wrote {path}."
-    elif description is not None and not source.path.is_file():
-        last_line = (
-            "Look at the traces (--out FOLDER); if they are right, write the description with "
-            "--save."
-        )
+    if description is not None:
+        shown = description.to_toml()
+        if save:
+            seen = Seen(
+                recordings=len(dataset) + dataset.unlabelled + len(dataset.faults),
+                good=survey.good,
+                bad=survey.bad,
+            )
+            path = replace(description, seen=seen).save(source.path, force)
+            last_line = f"Wrote {path}."
+        elif not source.path.is_file():
+            last_line = (
+                "Look at the traces (--out FOLDER); if they are right, write the description with "
+                "--save."
+            )
     print_result(
         {"data": source.data, "description": shown, "survey": survey, "notes": dataset.notes},
         *filter(None, [shown, *_survey_parts(dataset, survey), last_line]),
@@ -116,31 +124,6 @@ def data(
     )
     if check and dataset.faults:
         context.exit(1)
-
-
-def _print_open_keys(source: DataChoice, description: "Description", path: Path | None) -> None:
-    """Print a description with `?` in it, and the keys that the user must state, with their notes.
-
-    A description says how recordings are read, and a note what is open about a key of it; without
-    one the text is "not known". With `--json` a document with the data's name, the description and
-    these keys is printed instead.
-
-    Parameters
-    ----------
-    source : DataChoice
-        The data set that the user asked for; only its name is used.
-    description : Description
-    path : Path or None
-        The file to which the description was written, which is printed; None: nothing was written.
-    """
-    text = description.to_toml()
-    print_result(
-        {"data": source.data, "description": text, "open": description.open_keys},
-        text,
-        f"Wrote {path}." if path else "",
-        "Still open, so nothing was read; state each with --set KEY=VALUE:",
-        *(f"- {key}: {description.notes.get(key, 'not known')}" for key in description.open_keys),
-    )
 
 
 def _survey_parts(dataset: "Dataset", survey: "Survey") -> Iterator[Any]:

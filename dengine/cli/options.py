@@ -204,11 +204,13 @@ def _address(
     """
     from ..store.records import address
 
-    if store is None and (cell_id or product):
+    if store is not None:
+        return address(store, cell_id, product)
+    if cell_id or product:
         raise click.UsageError(
             "--cell-id and --product need a store; give one with --store FILE|URL."
         )
-    return None if store is None else address(store, cell_id, product)
+    return None
 
 
 _CELL_ID = "The cell, if the store holds several; `dengine status` lists them.  [default: cell]"
@@ -769,7 +771,6 @@ def n_jobs_option(default: int, text: str) -> Option:
     """
     return click.option(
         "--n-jobs",
-        type=int,
         default=default,
         callback=lambda _, option, n_jobs: n_jobs or -1,
         help=text,

@@ -119,9 +119,8 @@ class Out:
 
         paths = []
         for name, content in contents.items():
-            path = self.path / name
             write: Any = save if isinstance(content, Figure) else write_csv
-            paths.append(write(content, path, force=self.force))
+            paths.append(write(content, self.path / name, force=self.force))
         return paths
 
 

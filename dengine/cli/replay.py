@@ -109,7 +109,7 @@ def _play(
                     advance(len(item.replay))
         except (KeyboardInterrupt, Exception) as interruption:  # what was finished is shown first
             error = interruption
-    return sorted(played, key=lambda item: item.position), error
+    return sorted(played), error
 
 
 def _end(error: BaseException | None, text: str, is_shown: bool = True) -> None:
@@ -125,9 +125,6 @@ def _end(error: BaseException | None, text: str, is_shown: bool = True) -> None:
         if is_shown:
             click.echo(f"Interrupted: {text}", err=True)
         raise error
-
-
-_SHUFFLES = "Number of shuffled replays of each recipe."
 
 
 def stream_options(repeats: int, least: int, n_jobs: int, text: str) -> options.Option:
@@ -193,6 +190,7 @@ def stream_options(repeats: int, least: int, n_jobs: int, text: str) -> options.
     return options.bundle_options("stream", make_stream, flags)
 
 
+replay_stream = stream_options(30, 1, 1, "Number of shuffled replays of each recipe.")
 GRID_LISTS = {
     "alphas": click.option(
         "--alphas", type=CommaList(ALPHA), help="Values to try, like 0.5,0.1,0.05."
@@ -214,7 +212,7 @@ POLICY_LISTS = GRID_LISTS | {
 )
 @options.data_options()
 @options.recipe_options
-@stream_options(30, 1, 1, _SHUFFLES)
+@replay_stream
 @options.check_option
 @explain_option
 @options.out_option("replays.csv", "curves.png")
@@ -242,7 +240,7 @@ def replay(choice: RecipeChoice, **played: Any) -> None:
     "--paper", is_flag=True, help="The paper's whole grid: 3 alphas, 3 lower bounds, 2 intervals."
 )
 @options.bundle_options("lists", dict, POLICY_LISTS)
-@stream_options(30, 1, 1, _SHUFFLES)
+@replay_stream
 @options.check_option
 @explain_option
 @options.out_option("replays.csv", "curves.png")
@@ -349,7 +347,10 @@ def _replay_and_print(
     frame = tables.frame_of(replays, check_seconds)
     rows = tables.pool(frame, replays)
     by_name = _group_replays(replays, lambda replay: replay.name)
-    title = _title(dataset.name, replays, by_name, not stream.shuffle)
+    order = "shuffled" if stream.shuffle else "in recorded order"
+    subject = "simulated insertions" if dataset.name == "insertion" else dataset.name
+    repeats = counted(len({replay.seed for replay in replays}), "replay")
+    title = f"{', '.join(by_name)} on {subject}, {order}, {repeats} of {len(replays[0])} cycles"
     record = {
         "data": dataset.name,
         "in_order": not stream.shuffle,
@@ -381,21 +382,6 @@ def _group_replays(
     Replays with one key must follow each other; otherwise only those of the last group count.
     """
     return {name: list(group) for name, group in groupby(replays, key)}
-
-
-def _title(data: str, replays: Sequence[Replay], names: Iterable[str], in_order: bool) -> str:
-    """Return the title of tables and pictures.
-
-    It has the names of what was played (`names`: recipes, the settings of an engine, and baselines,
-    published methods), the data set, the order of the parts (recorded if `in_order`, else
-    shuffled), the number of seeds, and the number of parts that a replay played. The data set
-    "insertion", which comes with dengine, is called "simulated insertions". There must be at least
-    one replay.
-    """
-    order = "in recorded order" if in_order else "shuffled"
-    dataset = "simulated insertions" if data == "insertion" else data
-    repeats = counted(len({replay.seed for replay in replays}), "replay")
-    return f"{', '.join(names)} on {dataset}, {order}, {repeats} of {len(replays[0])} cycles"
 
 
 def _replay_files(
