@@ -79,7 +79,7 @@ def read_sensor(
     array of float32, shape (samples,)
         In newtons.
     """
-    keep = float(np.exp(-2 * np.pi * parameters.bandwidth_hz / RATE_HZ))
+    keep = np.exp(-2 * np.pi * parameters.bandwidth_hz / RATE_HZ)
     # The sensor has a low-pass filter of first order.
     true: Floats = lfilter([1 - keep], [1, -keep], force)
     samples = len(true)
@@ -166,7 +166,7 @@ def insert_once(
     pushed = push(conditions, time_step_s)
     # The faults of the sensor have a stream of their own, so that they do not reveal the outcome.
     ranges = [getattr(parameters, field.name) for field in fields(SensorFaults)]
-    faults = SensorFaults(*(float(sensor_rng.uniform(*limits)) for limits in ranges))
+    faults = SensorFaults(*(sensor_rng.uniform(*limits) for limits in ranges))
     faults = replace(faults, bias_n=faults.bias_n + parameters.bias_offset_n)
     success = abs(pushed.height_mm) <= parameters.height_tolerance_mm
     return SimulatedInsertion(
@@ -310,7 +310,7 @@ class SimulatedCell:
         """
         success = self._take_waiting("proceed").success
         # It depends on the part alone.
-        chance = float(_make_generators(self.seed, self._done - 1)[2].random())
+        chance = _make_generators(self.seed, self._done - 1)[2].random()
         if success or chance < self.parameters.unreported_share:
             return Outcome.UNKNOWN
         self.clock += self.parameters.stop_s

@@ -220,7 +220,7 @@ def draw_conditions(parameters: CellParameters, rng: Generator) -> Conditions:
         around 0.
         """
         value = getattr(parameters, setting) if isinstance(setting, str) else setting
-        return float(rng.uniform(*value) if isinstance(value, tuple) else rng.normal(0.0, value))
+        return rng.uniform(*value) if isinstance(value, tuple) else rng.normal(0.0, value)
 
     without_fault = {"fault": "none", "extra_width_mm": 0.0, "debris_mm": 0.0}
     # The values are drawn in the order of the fields.
