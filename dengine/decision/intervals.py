@@ -267,7 +267,7 @@ def wald_bound(n_success: int, n_failure: int, z: float) -> ScalarBounds:
         return 0.0, 1.0
     rate = n_success / total
     half_width = z / math.sqrt(total) * math.sqrt(n_success * n_failure / (total * total))
-    return max(0.0, min(rate - half_width, rate)), min(1.0, max(rate + half_width, rate))
+    return max(0.0, rate - half_width), min(1.0, rate + half_width)
 
 
 SCALAR_BOUNDS: dict[str, ScalarBound] = {"wilson": wilson_bound, "binomial": wald_bound}

@@ -313,13 +313,13 @@ def _discriminants(gate: NoveltyGate, x: Tensor, plain: Tensor, used: Tensor) ->
     # The covariance of few traces is not known: it is shrunk towards the identity.
     shrinkage = (int(used.sum()) / len(plain)) ** 2
     covariance = torch.cov(z.T) + shrinkage * torch.eye(plain.size(1), dtype=z.dtype)
-    some = slice(None, None, max(1, len(plain) // DISTORTED))
+    step = max(1, len(plain) // DISTORTED)
     directions = []
-    for distorted in _distort(x[some]):
+    for distorted in _distort(x[::step]):
         features = gate.plain_features(distorted).double().nan_to_num()
         other = torch.addcmul(offset, features, gain).clamp(-6.0, 6.0)
         directions.append(
-            torch.linalg.solve(covariance + 0.5 * torch.cov(other.T), (other - z[some]).mean(0))
+            torch.linalg.solve(covariance + 0.5 * torch.cov(other.T), (other - z[::step]).mean(0))
         )
     return (gain[:, None] * torch.stack(directions, 1)).float()
 
@@ -342,8 +342,8 @@ def _standardise(features: Tensor) -> tuple[Tensor, Tensor]:
     )
     mean = inner.mean(0)
     deviation = inner.std(0, unbiased=False)
-    floor = 1e-2 * deviation.median() + 1e-5 * mean.abs() + 1e-12
-    return -mean / (deviation + floor), 1.0 / (deviation + floor)
+    deviation += 1e-2 * deviation.median() + 1e-5 * mean.abs() + 1e-12
+    return -mean / deviation, 1.0 / deviation
 
 
 def _find_same(traces: TraceArray, parts: Ints | None) -> tuple[Tensor, int]:

@@ -224,7 +224,7 @@ class Policy:
         """
         settings = {f.name: values[f.name] for f in fields(cls) if f.name in values}
         limits = values.get("force_limits", values.get(OLD_NAME, NO_LIMITS))
-        settings["force_limits"] = () if limits == NO_LIMITS else tuple(limits.split())
+        settings["force_limits"] = [] if limits == NO_LIMITS else limits.split()
         return cls(**settings)
 
     def changed(self, **settings: Any) -> Self:

@@ -294,7 +294,7 @@ def is_close(points: Floats, expected: Floats, tolerance: float = SAME_POINTS) -
     A coordinate may differ by `tolerance` times (1 + the absolute value of the expected one). Equal
     infinities are close. For empty arrays it is True.
     """
-    return bool(np.allclose(points, expected, rtol=tolerance, atol=tolerance))
+    return np.allclose(points, expected, rtol=tolerance, atol=tolerance)
 
 
 class ModelPrediction(EngineModel):

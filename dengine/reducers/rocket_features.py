@@ -349,9 +349,10 @@ class RocketEncoder(nn.Module):
         deviation, mean = torch.std_mean(raw.double(), 0, unbiased=False)
         for tower in self.towers[1:]:  # of shares, those that vary more tell more
             deviation[tower] = deviation[tower].square().mean().sqrt()
-        floor = 1e-3 * deviation.median() + 1e-12  # or a feature that never varied would explode
-        self.gain.copy_(1.0 / (deviation + floor))
-        self.offset.copy_(-mean / (deviation + floor))
+        # Or a feature that never varied would explode.
+        deviation += 1e-3 * deviation.median() + 1e-12
+        self.gain.copy_(1.0 / deviation)
+        self.offset.copy_(-mean / deviation)
 
 
 def compute_raw_features(encoder: RocketEncoder, traces: Floats) -> Tensor:

@@ -733,7 +733,7 @@ def standard_normal(rng: Generator, *shape: int) -> Tensor:
     return torch.from_numpy(rng.standard_normal(shape, dtype=np.float32))
 
 
-@lru_cache(maxsize=32)
+@lru_cache(32)
 def compile_fault(network: NetworkFactory, channels: int, samples: int) -> str:
     """Return why TorchScript cannot compile a network, and log it as a warning; "" if it can.
 
