@@ -562,7 +562,7 @@ def find_policy(
     policies, out_of_reach = _within_reach(
         contender,
         candidates(contender, costs, alphas, lower_bounds),
-        n_cycles * float(data.y.mean()),
+        n_cycles * data.y.mean(),
     )
     expect(
         bool(policies),
@@ -793,7 +793,7 @@ def _choose(groups: Groups, costs: Costs) -> tuple[list[PolicyCost], PolicyCost,
     rows.sort(key=lambda row: (row.cost, row.escaped, -row.policy.lower_bound))
     cheapest = rows[0]
     marked = cheapest
-    for row in rows[1:]:
+    for row in rows:
         if row.escaped < marked.escaped and row.expected_cost < costs.check:
             mean, error = _difference(groups[row.policy], groups[cheapest.policy], costs)
             if mean <= error * normal_quantile(2 * ERROR_LEVEL):  # one-sided

@@ -11,7 +11,6 @@ import numpy as np
 from ..datasets import Dataset, Fault
 from ..folds import content_hash, trace_hash
 from ..model.neighbours import NEWEST, near_repeats
-from ..records import Ints
 from ..traces import LARGEST, as_traces
 
 
@@ -113,6 +112,9 @@ def survey_dataset(data: Dataset) -> Survey:
         [trace_hash(content, part) for content, part in zip(hashes.tolist(), parts, strict=True)],
         dtype=np.int64,
     )
+    lengths = None
+    if data.lengths is not None and len(data.lengths):
+        lengths = Spread(*np.quantile(data.lengths, (0.0, 0.5, 1.0)).tolist())
     return Survey(
         **{
             name: getattr(data, name)
@@ -121,7 +123,7 @@ def survey_dataset(data: Dataset) -> Survey:
         **dict(zip(("traces", "channels", "samples"), X.shape, strict=True)),
         names=data.channels,
         seconds=None if data.rate_hz is None else X.shape[2] / data.rate_hz,
-        lengths=_spread(data.lengths),
+        lengths=lengths,
         good=n_good,
         bad=len(data) - n_good,
         not_finite=int((~finite).sum()),
@@ -133,10 +135,3 @@ def survey_dataset(data: Dataset) -> Survey:
         looked_at=min(n_usable, NEWEST),
         parts=None if data.part is None else len(set(parts)),
     )
-
-
-def _spread(lengths: Ints | None) -> Spread | None:
-    """Return the smallest, median and largest length (n,), as floats; None if there are none."""
-    if lengths is None or not len(lengths):
-        return None
-    return Spread(*np.quantile(lengths, (0.0, 0.5, 1.0)).tolist())

@@ -278,7 +278,7 @@ def write_csv(frame: pd.DataFrame, path: str | Path, force: bool = False) -> Pat
     """
     return write_output(
         path,
-        frame.to_csv(index=False, lineterminator="\n").encode("utf-8"),
+        frame.to_csv(index=False, lineterminator="\n").encode(),
         force,
         make_folder=True,
     )
