@@ -247,9 +247,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         self._live = LiveModel(
             template, TrainingWindow(recipe.window), self._outbox, self._settings
         )
-        peers = None
-        if store.product is not None:
-            peers = Peers(self._live, clock)
+        peers = None if store.product is None else Peers(self._live, clock)
         self._feedback = Feedback(self._live, on_safe_mode)
         retrainer = Retrainer(
             self._live.window,
@@ -592,32 +590,14 @@ class DataEngine(AbstractContextManager["DataEngine"]):
                 if earlier is not None:
                     return earlier
             self._learner.advance()  # the newest version is to answer
-            decision = self._decide(trace, number, id_)
+            x = self._maker.convert(trace)  # a wrong trace raises before it confirms a part
+            self._learner.catch_up()
+            self._feedback.confirm_unreported()
+            stored = self._maker.record(x, number, id_)
+            if id_ is not None:
+                stored = self._maker.sync(stored)
+            self._feedback.record_decision(stored)
             self._feedback.announce_safe_mode()  # last: a user's function may fail
-        return decision
-
-    def _decide(self, trace: ArrayLike, part: str | None, decision_id: str | None) -> Decision:
-        """Decide on one trace by the model, record the decision and return it.
-
-        These are the steps. The trace is converted, so that a wrong trace raises before it could
-        confirm an earlier part. If the decision rule, which learns from outcomes, was updated with
-        a wrong one, it is put right; a model that cannot change a label is retrained for that
-        (`Learner.catch_up`). Accepted parts that nobody reported are confirmed as good (with
-        `stops="all"`, under which every bad one is reported in time) or counted, which may change
-        the rule. The decision is made and recorded; without a `decision_id` it gets a new id. With
-        a `decision_id` the call waits until the decision is on disk; if the disk does not take it
-        in time, an ACCEPT or REJECT becomes VERIFY. The decision is then noted as a check or an
-        outcome that is waited for, and checks without a report for too long (`Policy.label_within`)
-        count as wrong decisions, which may change the rule, too. Raises what
-        `DecisionMaker.convert` raises, before anything else is done.
-        """
-        x = self._maker.convert(trace)
-        self._learner.catch_up()
-        self._feedback.confirm_unreported()
-        stored = self._maker.record(x, part, decision_id)
-        if decision_id is not None:
-            stored = self._maker.sync(stored)
-        self._feedback.record_decision(stored)
         return stored.decision
 
     def report(self, decision_id: str, success: bool) -> RetrainReport | None:
@@ -685,7 +665,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
             if stored.quarantined:
                 return None
             # Last, since it may take its budget.
-            return self._learner.retrain_if_due(self._settings.now.recipe.retrain_every)
+            return self._learner.retrain_if_due(self.recipe.retrain_every)
 
     def run(self, cell: Cell, cycles: int) -> Iterator[Cycle]:
         """Drive a robot cell, and yield a record of each cycle as it happens.
@@ -915,7 +895,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
     @property
     def policy(self) -> Policy:
         """The policy in force; `set_policy` changes it."""
-        return self._settings.now.recipe.policy
+        return self.recipe.policy
 
     def set_policy(self, policy: Policy, author: str = "") -> Changed:
         """Decide by another policy from the next decision on; see `Corrections.set_policy`."""
