@@ -8,7 +8,7 @@ Each change is an event that is kept for ever. Nothing is overwritten: a correct
 an earlier version is put in force again as a new version, and a decision stays as it was decided.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -203,7 +203,7 @@ class Corrections:
             raise ReportError(
                 "Expected the ids of decisions to forget, got none; name at least one."
             )
-        decisions = self._find_labelled(list(dict.fromkeys(decision_ids)))
+        decisions = self._find_labelled(dict.fromkeys(decision_ids))
         forgotten = [stored for stored in decisions if stored.success is not None]
         labels = {stored.decision.id: stored.success for stored in forgotten}
         if not labels:
@@ -253,7 +253,7 @@ class Corrections:
             the engine is closed, was opened for reading or before a fork. A change that was stored
             before the error stays stored.
         """
-        self._bring_up_to_date()
+        self._learner.bring_up_to_date()
         if not self._live.pinned:
             return self._as_unchanged("release", "No version is pinned")
         return self._finish_change(self._learner.release(author))
@@ -317,7 +317,7 @@ class Corrections:
             version,
             "`store.versions.retrains()` lists them",
         )
-        self._bring_up_to_date()
+        self._learner.bring_up_to_date()
         before = self._live.version
         pinned = self._live.pinned
         if pinned and version in (before, pinned):
@@ -406,9 +406,9 @@ class Corrections:
         is_baseline = present.model is not None  # it keeps its rule
         if is_baseline:
             refuse_idle(sorted(changes.keys() - BASELINE_SETTINGS))
-        self._bring_up_to_date()
+        self._learner.bring_up_to_date()
         starts_anew = not is_baseline and (
-            any(name in changes for name in SCORING)
+            changes.keys() & SCORING
             # Audits count by the inclusion probability, so pooled evidence must be of one rate.
             or policy.rule().extra_arguments != old_policy.rule().extra_arguments
         )
@@ -438,19 +438,8 @@ class Corrections:
             event, reason_ended="the rule of the new policy has no safe mode"
         )
 
-    def _bring_up_to_date(self) -> None:
-        """Finish what is under way: a correction comes after everything that was known before it.
-
-        A trained version is put in force or dropped, and a training that is not done is discarded
-        and begins again later. Labels reach the store, and labels, corrections and versions of the
-        product's other robot cells are taken in. Raises StoreError if the engine is closed, only
-        reads or was opened before a fork, and if the store does not answer.
-        """
-        self._outbox.check_usable()
-        self._learner.bring_up_to_date()
-
-    def _find_labelled(self, decision_ids: Sequence[Any]) -> list[StoredDecision]:
-        """Finish what is under way (`_bring_up_to_date`), then return the decisions with these ids.
+    def _find_labelled(self, decision_ids: Iterable[Any]) -> list[StoredDecision]:
+        """Finish what is under way, then return the decisions with these ids.
 
         A trained version is put in force or dropped, and a training that is not done is discarded
         and begins again later; labels that wait are stored, and what other robot cells stored is
@@ -459,7 +448,7 @@ class Corrections:
         that never had a label. Raises StoreError if the engine is closed, only reads or was opened
         before a fork, if the store does not answer, and if a trace is damaged.
         """
-        self._bring_up_to_date()
+        self._learner.bring_up_to_date()
         decisions = []
         for id_ in decision_ids:
             stored = self._store.decisions.get(id_) if isinstance(id_, str) else None

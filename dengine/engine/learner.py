@@ -304,7 +304,7 @@ class Learner:
     @property
     def is_at_work(self) -> bool:
         """Whether a training is under way in the executor, or its version is not in force yet."""
-        return self._retrainer.future is not None or self._candidate is not None
+        return self._retrainer.future is not None or self.is_swapping
 
     @property
     def is_busy(self) -> bool:
@@ -507,9 +507,8 @@ class Learner:
         a store in memory the future is done.
         """
         report = candidate.complete_report(self.live.next_version)
-        state = None
-        if candidate.model is not None:
-            state = self.live.get_state(candidate.model, candidate.trained_on)
+        model = candidate.model
+        state = None if model is None else self.live.get_state(model, candidate.trained_on)
         return self._outbox.store_version(report, self._window.newest_seq, state)
 
     def _swap(self, candidate: Candidate) -> None:
@@ -619,11 +618,13 @@ class Learner:
     def bring_up_to_date(self) -> None:
         """Finish what is under way before a person's change: a training, labels, news of peers.
 
-        A trained version is put in force or dropped, and a training that is not done is discarded
-        and begins again later (`end_training`). News is what the product's other robot cells stored
-        (`_hear_of_peers`). A trained version that cannot be stored is dropped. Raises StoreError if
-        the store is unavailable.
+        So the change comes after everything that was known before it. A trained version is put in
+        force or dropped, and a training that is not done is discarded and begins again later
+        (`end_training`). News is what the product's other robot cells stored (`_hear_of_peers`). A
+        trained version that cannot be stored is dropped. Raises StoreError if the engine is closed,
+        only reads or was opened before a fork, and if the store is unavailable.
         """
+        self._outbox.check_usable()
         self.end_training()
         self.store_labels()
         self._hear_of_peers()
