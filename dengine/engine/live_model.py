@@ -402,9 +402,14 @@ class LiveModel:
         opens the store then rebuilds the rule, and does not take the stored one. Some arrays are
         views.
         """
-        state = model.get_state() | trained_on.to_state()
-        state["corrected_to"] = np.array(self.corrected_to)
-        state["overdue_to"] = np.array(self.overdue_to)
+        state = (
+            model.get_state()
+            | trained_on.to_state()
+            | {
+                "corrected_to": np.array(self.corrected_to),
+                "overdue_to": np.array(self.overdue_to),
+            }
+        )
         if self.overdue:
             # An engine that opens the store rebuilds the rule.
             state["includes_overdue"] = np.array(True)

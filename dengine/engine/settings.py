@@ -102,7 +102,7 @@ class EngineSettings:
             self.seed,
         )
         expect(
-            self.trace is None or isinstance(self.trace, TraceSpec),
+            isinstance(self.trace, TraceSpec | None),
             "a TraceSpec as trace",
             self.trace,
             "TraceSpec(samples=1000) for one",
