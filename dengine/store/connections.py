@@ -345,7 +345,7 @@ class Database:
         self.scope = self._open(product)
         # The file with what it was when it was opened. None: in memory, or a server.
         self._file: tuple[Path, os.stat_result] | None = None
-        if self.url.get_backend_name() == "sqlite" and self.url.database is not None:
+        if self.url.get_backend_name() == "sqlite" and not self.is_in_memory:
             file = sqlite_file(self.url)
             if file.is_file():
                 self._file = file, file.stat()
@@ -369,8 +369,8 @@ class Database:
                 with connection.begin():
                     prepare_tables(connection, self.cell_id, self.name)
                     check_key(connection, self.cell_id, self._key, begin=True)
-                    if (last := newest_entry(connection, self.cell_id)) is not None:
-                        self.newest_entry = last.number, last.digest.hex()
+                    if last := newest_entry(connection, self.cell_id):
+                        self.newest_entry = last["number"], last["digest"].hex()
                     return Scope(self.cell_id, join_product(connection, self.cell_id, product))
         except StoreError:
             self._engine.dispose()

@@ -171,7 +171,7 @@ def check_key(connection: sa.Connection, cell_id: str, key: bytes, begin: bool =
     """
     tag = hmac.new(key, b"dengine ledger", "sha256").hexdigest() if key else None
     stored = read_setting(connection, cell_id, LEDGER_KEY)
-    if begin and stored is None and tag and newest_entry(connection, cell_id) is None:
+    if begin and stored is None and tag and not newest_entry(connection, cell_id):
         insert_settings(connection, cell_id, {LEDGER_KEY: tag})
     elif stored != tag:
         begun = "with another key"
@@ -187,16 +187,17 @@ def check_key(connection: sa.Connection, cell_id: str, key: bytes, begin: bool =
 
 
 def newest_entry(connection: sa.Connection, cell_id: str) -> Any:
-    """Return a row (number, digest, chains) of a cell's newest ledger entry; None if it has none.
+    """Return number, digest and chains of a cell's newest ledger entry, by name; {} without one.
 
     The ledger is the cell's hash chain, with an entry for each transaction. `digest` is 32 bytes.
     `chains` is JSON: by the name of the table (label, correction, model_version or setting) a
     digest over all rows that it has so far, for settings over the present ones. A table that never
     had a row is missing there.
     """
-    return connection.execute(
+    rows = connection.execute(
         _entries_query(cell_id).with_only_columns(*LEDGER.c["number", "digest", "chains"]).limit(1)
-    ).first()
+    )
+    return rows.mappings().first() or {}
 
 
 def _entries_query(cell_id: str) -> Query:
@@ -292,13 +293,9 @@ class LedgerEntry:
         self._cell_id = cell_id
         self._key = key
         last = newest_entry(connection, cell_id)
-        self._number = 1
-        self._previous = START
-        self._chains: dict[str, str] = {}
-        if last is not None:
-            self._number = last.number + 1
-            self._previous = last.digest
-            self._chains = parse_object(last.chains)
+        self._number = last.get("number", 0) + 1
+        self._previous = last.get("digest", START)
+        self._chains = parse_object(last.get("chains"))
         self._sums: dict[str, list[bytes]] = {}
         self.settings = False
 
@@ -338,7 +335,7 @@ class LedgerEntry:
         """
         if not (self._sums or self.settings):
             return None
-        chains = dict(self._chains)
+        chains = self._chains
         for name in IN_FORCE:
             if name in self._sums:
                 chains[name] = _extend_chain(chains.get(name, ""), self._sums[name])
@@ -389,10 +386,10 @@ def find_integrity_error(connection: sa.Connection, cell_id: str, key: bytes, fi
         check_key(connection, cell_id, key)
     except StoreError as error:
         return f"{error}"
-    rows = connection.execute(_entries_query(cell_id).limit(2))
-    newest, before = [*(row._asdict() for row in rows), {}, {}][:2]
+    rows = connection.execute(_entries_query(cell_id).limit(2)).mappings()
+    newest, before = [*rows, {}, {}][:2]
     previous = before.get("digest", START)
-    if newest and newest["digest"] != entry_digest(previous, newest | {"digest": None}, key):
+    if newest and newest["digest"] != entry_digest(previous, {**newest, "digest": None}, key):
         return "the newest entry of the ledger is not as it was written"
     chains = parse_object(newest.get("chains"))
     settings = _settings_chain(_settings_text(connection, cell_id))
