@@ -535,15 +535,14 @@ def columns(record_type: Any) -> dict[str, tuple[type, bool]]:
     `dict[str, int]` is `dict`, and that of a union is its first. A union must be written with `|`,
     and have None as the last. The result is cached; do not change it.
     """
-    fields: dict[str, tuple[type, bool]] = {}
-    for name, hint in get_type_hints(record_type).items():
-        is_union = isinstance(hint, UnionType)
-        fields[name] = (_plain_type(get_args(hint)[0] if is_union else hint), is_union)
-    return fields
+    hints = get_type_hints(record_type)
+    return {name: (_plain_type(hint), isinstance(hint, UnionType)) for name, hint in hints.items()}
 
 
 def _plain_type(hint: Any) -> type:
-    """Return the class of a type hint that is no union: `dict` for `dict[str, int]`."""
+    """Return the class of a type hint, of a union's first: `dict` for `dict[str, int] | None`."""
+    if isinstance(hint, UnionType):
+        return _plain_type(get_args(hint)[0])
     plain = get_origin(hint) or hint
     # A `type` statement names its type here; NumPy's NDArray is one on Python 3.12 and later.
     return _plain_type(plain.__value__) if hasattr(plain, "__value__") else plain
