@@ -98,7 +98,8 @@ def decode_record(blob: bytes) -> Record:
     with instead(
         StoreError,
         "Expected a record of a journal, got what cannot be read",
-        *(struct.error, *DAMAGES),
+        struct.error,
+        *DAMAGES,
         do="open the store with the dengine that wrote it",
     ):
         (length,) = LENGTH.unpack_from(blob)

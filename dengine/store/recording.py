@@ -85,7 +85,7 @@ class Recorder:
         self.journal = journal
         self._clock = clock
         self.limit = limit
-        self.changed = threading.Condition(threading.RLock())
+        self.changed = threading.Condition()
         self.unwritten: deque[Entry] = deque()
         self._wanted = 0  # up to this record somebody waits for a sync
         self._n_failed = 0  # writes
@@ -234,27 +234,28 @@ class Recorder:
         database had its records (the journal then still uses the lost file); the entries then stay
         in `unwritten`.
         """
-        if self.journal.end > LONG:  # a cell that never pauses would fill the disk
+        journal = self.journal
+        if journal.end > LONG:  # a cell that never pauses would fill the disk
             with self.changed:
                 self.needs_drain = True
                 self.changed.notify_all()
-                is_drained = self.changed.wait_for(lambda: self.journal.is_drained, BATCH_SECONDS)
+                is_drained = self.changed.wait_for(lambda: journal.is_drained, BATCH_SECONDS)
                 self.needs_drain = False
             if is_drained:  # without the lock: a disk that hangs would hang the cell
-                self.journal.clear()
+                journal.clear()
         blobs = [encode_record(entry.record) for entry in batch]
         try:
-            offsets = self.journal.append(blobs, self._clock())
+            offsets = journal.append(blobs, self._clock())
         except LostJournalError as error:
             log.error("%s It is created again with what the store lacks.", error)
             with self.changed:  # nobody reads it or writes its header meanwhile
-                self.journal.recreate()
+                journal.recreate()
             self.record_event(
                 "journal", f"{error} It was created again with what the store lacked."
             )
-            offsets = self.journal.append(blobs, self._clock())
+            offsets = journal.append(blobs, self._clock())
         with self.changed:
-            ends = [*offsets[1:], self.journal.end]
+            ends = [*offsets[1:], journal.end]
             for entry, offset, end in zip(batch, offsets, ends, strict=True):
                 entry.offset = offset
                 entry.end = end
