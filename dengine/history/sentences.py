@@ -84,7 +84,7 @@ class Circumstances:
         """Name of a handed-in model whose thresholds are not known, which is taken to decide by its
         own method; "" for any other model.
         """
-        return self.model if self.model is not None and self.thresholds is None else ""
+        return (self.model or "") if self.thresholds is None else ""
 
 
 def bound_of(decision: Decision, circumstances: Circumstances) -> Bound | None:
@@ -98,15 +98,12 @@ def bound_of(decision: Decision, circumstances: Circumstances) -> Bound | None:
     """
     if decision.reason not in BOUNDED:
         return None
-    accept_threshold, reject_threshold, origin = _find_thresholds(circumstances)
     return Bound(
-        n_success=decision.n_success,
-        n_failure=decision.n_failure,
-        lower=decision.lower,
-        upper=decision.upper,
-        accept_threshold=accept_threshold,
-        reject_threshold=reject_threshold,
-        origin=origin,
+        decision.n_success,
+        decision.n_failure,
+        decision.lower,
+        decision.upper,
+        *_find_thresholds(circumstances),
     )
 
 
