@@ -5,7 +5,7 @@ engine when Prometheus reads them.
 """
 
 from collections.abc import Iterator, Mapping
-from typing import NamedTuple
+from typing import Any
 
 from prometheus_client import CollectorRegistry, Histogram
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
@@ -19,38 +19,26 @@ RESPONSE_BUCKETS = 0.0002, 0.0005, 0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0
 RETRAIN_BUCKETS = 0.05, 0.1, 0.2, 0.3, 0.45, 0.6, 1.0, 2.0, 5.0, 15.0, 60.0
 
 
-class HistogramSpec(NamedTuple):
-    """A histogram of durations in seconds, of which `Metrics` makes dengine_NAME_seconds.
-
-    `labels` are names of fields of the observed record, and `buckets` the upper limits of the
-    buckets in seconds.
-    """
-
-    name: str
-    description: str
-    labels: tuple[str, ...]
-    buckets: tuple[float, ...]
-
-
-HISTOGRAMS: Mapping[type, HistogramSpec] = {
-    ServiceResponse: HistogramSpec(
-        "decide",
-        "Seconds from a request for a decision to its response, waiting included.",
-        ("action", "reason"),
-        RESPONSE_BUCKETS,
-    ),
-    ReportResponse: HistogramSpec(
-        "report",
-        "Seconds from a reported outcome until it is on disk.",
-        ("success", "repeated"),
-        RESPONSE_BUCKETS,
-    ),
-    RetrainReport: HistogramSpec(
-        "retrain",
-        "Seconds from taking the data until the new version decides.",
-        ("accepted",),
-        RETRAIN_BUCKETS,
-    ),
+# Arguments of Prometheus's `Histogram` by the type of the response, whose fields are its labels.
+HISTOGRAMS: Mapping[type, dict[str, Any]] = {
+    ServiceResponse: {
+        "name": "dengine_decide_seconds",
+        "documentation": "Seconds from a request for a decision to its response, waiting included.",
+        "labelnames": ("action", "reason"),
+        "buckets": RESPONSE_BUCKETS,
+    },
+    ReportResponse: {
+        "name": "dengine_report_seconds",
+        "documentation": "Seconds from a reported outcome until it is on disk.",
+        "labelnames": ("success", "repeated"),
+        "buckets": RESPONSE_BUCKETS,
+    },
+    RetrainReport: {
+        "name": "dengine_retrain_seconds",
+        "documentation": "Seconds from taking the data until the new version decides.",
+        "labelnames": ("accepted",),
+        "buckets": RETRAIN_BUCKETS,
+    },
 }
 
 
@@ -67,14 +55,8 @@ class Metrics:
         self._service = service
         self._registry = CollectorRegistry()
         self._histograms = {
-            kind: Histogram(
-                f"dengine_{spec.name}_seconds",
-                spec.description,
-                spec.labels,
-                buckets=spec.buckets,
-                registry=self._registry,
-            )
-            for kind, spec in HISTOGRAMS.items()
+            kind: Histogram(**arguments, registry=self._registry)
+            for kind, arguments in HISTOGRAMS.items()
         }
         self._registry.register(self)
         service.observers.append(self.observe)
@@ -90,7 +72,7 @@ class Metrics:
         """
         kind = type(response)
         record = response.decision if isinstance(response, ServiceResponse) else response
-        labels = [str(getattr(record, name)).lower() for name in HISTOGRAMS[kind].labels]
+        labels = [str(getattr(record, name)).lower() for name in HISTOGRAMS[kind]["labelnames"]]
         self._histograms[kind].labels(*labels).observe(response.seconds)
 
     def text(self) -> bytes:
