@@ -93,8 +93,8 @@ def it_embeds_every_trace_in_every_space(reducer: Any) -> None:
     must return the points of n traces, with d coordinates each: finite float32 of shape (n, K, d),
     equal for two clones with the same training, with K of 2 or more if labels are used. `transform`
     must return shape (n, d). `embed_references(X, fold)` must return, for trace i with fold k, the
-    point `embed(X)[i, k]`. None of them may write to the given traces. Too few axes or spaces may
-    raise IndexError instead. `reducer` may be unfitted and stays unchanged.
+    point `embed(X)[i, k]`. None of them may write to the given traces. A `transform` of another
+    number of axes raises SettingError instead. `reducer` may be unfitted and stays unchanged.
     """
     assert isinstance(reducer, BaseEstimator), (
         f"{type(reducer).__name__} is no scikit-learn estimator"
@@ -148,7 +148,7 @@ def labels_come_only_where_it_says_that_it_uses_them(reducer: Any) -> None:
     A transformer that is no `Reducer` must have scikit-learn's tag `target_tags.required` instead.
     Otherwise an engine would pass no labels, and every retrain would fail. Clones are fitted to
     test traces, so `reducer` stays unchanged. If `fit` fails with labels as well, its error is
-    raised unchanged.
+    raised unchanged. A reducer that uses labels passes.
     """
     X, y = toy_traces()
     traces = X if isinstance(reducer, Reducer) else X[:, 0]

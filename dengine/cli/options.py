@@ -182,8 +182,9 @@ def bundle_options(into: str, make: Callable[..., Any], options: Mapping[str, Op
 
         @wraps(command)
         def bundled(**values: Any) -> Any:
-            taken = {k: value for k in options if (value := values.pop(k)) is not None}
-            return command(**{into: make(**taken)}, **values)
+            taken = {name: values.pop(name) for name in options}
+            given = {name: value for name, value in taken.items() if value is not None}
+            return command(**{into: make(**given)}, **values)
 
         decorated: Command = bundled
         for option in reversed(list(options.values())):

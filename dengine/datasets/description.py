@@ -19,7 +19,7 @@ from dataclasses import dataclass, field, fields, replace
 from pathlib import Path, PurePath
 from typing import Any, Literal, get_args, get_origin
 
-from ..errors import DataError, instead, listed
+from ..errors import DataError, instead, listed, shortened
 from ..files import FilePath, toml_value, write_output
 from .dataset import expect_data
 
@@ -155,10 +155,13 @@ class Channel:
     limit: float = 0.0
 
 
-def _check_path(path: str) -> None:
-    """Raise DataError unless a text is a regular expression with one group, empty, or `?`."""
-    wanted = "a regular expression with one group in path"
-    with instead(DataError, f"Expected {wanted}, got {path}", re.error):
+def _check_path(path: str, key: str) -> None:
+    """Raise DataError unless a text is a regular expression with one group, empty, or `?`.
+
+    key : what the text is the value of, for the message.
+    """
+    wanted = f"a regular expression with one group in {key}"
+    with instead(DataError, f"Expected {wanted}, got {shortened(path)}", re.error):
         expect_data(path in ("", UNKNOWN) or re.compile(path).groups == 1, wanted, path)
 
 
@@ -180,7 +183,7 @@ class PartSource:
     line: str = ""
 
     def __post_init__(self) -> None:
-        _check_path(self.path)
+        _check_path(self.path, "part.path")
 
 
 @dataclass(frozen=True, slots=True)
@@ -196,14 +199,15 @@ class LabelSource:
         Beginning of a line above the header, in front of the label, which is the rest of the line,
         up to a comma with a blank behind it.
     topic
-        Topic of a bag whose next message is the label.
+        Topic of a bag whose messages, between the start of a part and of the next, are the label.
     listing
         File beside the recordings that lists the labels, in its `column`.
     key
         Column of the listing with the part's number or the recording's file. Capital letters do not
         count, nor, in a file, its suffix, leading zeros, and folders that only one of both has.
     at
-        Which row has the label, if it changes within a recording: `same`, `first` or `last`.
+        Which row, or message of the topic, has the label, if it changes within a recording:
+        `same`, `first` or `last`.
     good
         Words for a good part.
     bad
@@ -224,7 +228,7 @@ class LabelSource:
     unchecked: Words = ()
 
     def __post_init__(self) -> None:
-        _check_path(self.path)
+        _check_path(self.path, "label.path, or path of a check")
 
     @property
     def meanings(self) -> dict[str, int | None]:

@@ -354,10 +354,7 @@ def _to_onnx(decision: OnnxDecision, spec: TraceSpec) -> Any:
     level = logging.root.manager.disable
     logging.disable(logging.WARNING)
     try:
-        with (
-            warnings.catch_warnings(),
-            instead(ExportError, "torch makes no ONNX program", Exception, do="export torchscript"),
-        ):
+        with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             program: Any = torch.onnx.export(
                 decision,
@@ -369,6 +366,12 @@ def _to_onnx(decision: OnnxDecision, spec: TraceSpec) -> Any:
                 verbose=False,
             )
             return program.model_proto
+    except Exception as error:
+        cause: BaseException = error
+        while cause.__cause__ is not None:  # the innermost one names the layer
+            cause = cause.__cause__
+        why = str(cause).partition("\n")[0]
+        raise ExportError(f"torch makes no ONNX program: {why}; export torchscript.") from error
     finally:
         logging.disable(level)
 

@@ -57,14 +57,15 @@ def propose_clock(p: Proposal) -> None:
     """Find the column of times and its form, and set `time.column` and `time.format` in `p`.
 
     `p` is the description so far; only columns without a use in it are looked at. `time.column`
-    becomes the only column that may tell the time, by its cells or its name (`is_clock`). It is set
+    becomes the only column that may tell the time (`is_clock`), by its cells or its name or, if no
+    column has these, by its unit. It is set
     to `?` (the user must answer), with a note, if others may be it, too, or a part of it
     (`names_of_clocks`), or if only such others may; if there are none, it stays empty. Stated
     columns are kept; only their forms are found. Of a column that is set, `time.format`, its unit
     or a pattern like `%H:%M:%S`, may be `?` (`form_of`). Raises SettingError for a malformed
     `windows.trigger`, the condition at which long recordings are cut.
     """
-    clocks = [*filter(is_clock, p.unused)]
+    clocks = likely_clocks(p.unused)
     if "time.column" not in p.stated:
         names = names_of_clocks(p, clocks)
     else:
@@ -86,6 +87,15 @@ def propose_clock(p: Proposal) -> None:
             f"{as_option('time.column', names[:2])}, or []: none; "
             "with time.sort=true if the rows of a part are not in the order of time",
         )
+
+
+def likely_clocks(columns: Sequence[Column]) -> list[Column]:
+    """Return the columns that may tell the time (`is_clock`) by cells or name, else by their unit.
+
+    Raises UnreadableError if cells are lists.
+    """
+    clocks = [*filter(is_clock, columns)]
+    return [c for c in clocks if c.forms or CLOCK_NAME.search(c.name)] or clocks
 
 
 def names_of_clocks(p: Proposal, clocks: Sequence[Column]) -> list[str]:
@@ -126,10 +136,11 @@ def is_clock(column: Column) -> bool:
     most 10 % of the steps, like a counter that begins again, or in at least 90 %, if the newest row
     is the first. Raises UnreadableError if cells are lists.
     """
-    is_named = CLOCK_NAME.search(column.name) or column.unit in TIME_UNITS
+    is_named = CLOCK_NAME.search(column.name)
     if column.forms or (is_named and column.odd):
         return not column.fixed
-    if not is_named or column.unit in UNITS or not column.usual_step:
+    may_be = column.unit not in UNITS if is_named else column.unit in TIME_UNITS
+    if not may_be or column.odd or not column.usual_step:
         return False
     falls = (column.steps < 0).mean()
     return bool(min(falls, 1 - falls) <= FEW)

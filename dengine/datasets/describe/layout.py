@@ -52,7 +52,7 @@ def layout_of(p: Proposal, files: Tables) -> str:
             return wide
         p.notes["layout"] = (
             "no header names the columns. wide: a part in each row; files: in each file; long: "
-            "state part.column"
+            "below each other, with part.column"
         )
         return UNKNOWN
     if kind in OBJECTS and len(p.names) > 1 and len(first.lines) == 1:

@@ -45,12 +45,14 @@ QUALIFIER_NAME = re.compile(
 SIGNAL = re.compile(r"(?i)(force|kraft|torque|drehmoment|load|last)([_ ]?[xyz])?")
 WORD_BEGINS = r"(?i)(^|[^a-z]|(?-i:(?<=[a-z])(?=[A-Z])))"  # also in `forceUnit`
 SCALE_NAME = re.compile(
-    WORD_BEGINS + r"(unit(?!.*(serial|id|no|nr|under))|uom|einheit|scale|scaling|teiler"
+    WORD_BEGINS + r"(unit(?!.*(serial|id|no|nr|under))|uom|einheit|scale|scaling"
     r"|factor|faktor|gain|sensitivity|fs|dt|frequency|interval|takt"
     r"|(sampl\w*|abtast|scan|data|mess)[ _]?(rate|freq\w*))s?($|[^a-z])"
 )
-FACTOR_NAME = re.compile(r"(?i)scale(?!s)|scaling|factor|faktor|teiler|divisor")
-FACTOR = re.compile(r"(?!1([.,]0*)?$)[\d.,]+(e[-+]?\d+)?", re.IGNORECASE)  # not 1
+FACTOR_NAME = re.compile(
+    r"(?i)scale(?!s)|scaling|factor(?!y)|(?<!sicherheits)faktor|(?<!ver)teiler|divisor"
+)
+FACTOR = re.compile(r"(?!1([.,]0*)?$)-?\d[\d.,]*(e[-+]?\d+)?", re.IGNORECASE)  # not 1
 SET_VALUE = re.compile(
     WORD_BEGINS
     + r"(set|vorgabe|nominal|target|consigne|max|min|limit|(cmd|des|ref)(?![a-z])|comm?and"
@@ -318,10 +320,14 @@ def _other_scales(p: Proposal) -> Iterator[str]:
         words = [*part_words(source, p.tables).values()]
         n = len({*words})
         are_units = 2 * n <= len(words) and all(map(QUANTITY.fullmatch, words))
-        if n > 1 and (are_units or SCALE_NAME.search(name)):
+        is_factor = FACTOR_NAME.search(name)
+        if n > 1 and (are_units or is_factor or SCALE_NAME.search(name)):
             yield f"{name} differs, {counts_of(words)}: convert them first, or state channels"
-        if n == 1 and FACTOR_NAME.search(name) and FACTOR.fullmatch(words[0]):
-            yield f"{name} is {words[0]}: if samples are multiplied by it, channels.COLUMN.factor"
+        if n == 1 and is_factor and FACTOR.fullmatch(words[0]):
+            yield (
+                f"{name} is {words[0]}: if it scales the samples, state channels.COLUMN.factor, "
+                "else channels"
+            )
 
 
 def may_be_channel(column: Column) -> bool:

@@ -51,8 +51,8 @@ Rows = Sequence[Strings]
 class Look(NamedTuple):
     """The first lines of a file.
 
-    form : of the file. width : cells of a row. line : the header. rows : the cells of the samples.
-    is_closed : whether the last cell of each row is empty.
+    form : of the file. width : cells of a row. line : the header, "" if the user stated its number.
+    rows : the cells of the samples. is_closed : whether the last cell of each row is empty.
     """
 
     form: TextForm
@@ -94,13 +94,15 @@ def look(content: bytes, stated: Stated) -> Look:
     data = _first_row(rows[:MOST_LINES], width)
     is_closed = not any(row[-1] for row in rows[data:] if len(row) == width)
     header, units = _head_lines(rows[:data], width - is_closed, stated)
-    beginning = stated.get("text.header", header)
+    beginning = stated.get("text.header")
     if isinstance(beginning, str):
         found = (i for i, line in enumerate(lines[:data], 1) if line.startswith(beginning))
-        beginning = next(found, header)
-    header = beginning
+        header = next(found, header)
+    title = "".join(lines[header - 1 : header])
+    if isinstance(beginning, int):
+        header, title = beginning, ""  # the line may differ from file to file
     form = TextForm(encoding, delimiter, header=header, units=units, data=data + 1)
-    return Look(form, width, "".join(lines[header - 1 : header]), rows[data:], is_closed)
+    return Look(form, width, title, rows[data:], is_closed)
 
 
 def decode(content: bytes, stated: str) -> tuple[str, str]:
@@ -298,12 +300,11 @@ def _column_names(usual: Look) -> Strings:
 
     `#` or `%` at the beginning of the header is skipped. If it lacks the last column, and this is
     empty in all rows, the names are those of the header and one like `column3`. If it has one name
-    too many, like the `Comment` of LabVIEW, the last one is left out, unless a cell is a unit or
-    the delimiter a blank: then a name may stand in two cells. Without a header, or if it has
-    another number of cells than there are columns, the names are `c0`, `c1`, ...; for
-    20 columns or more it is `x*`, which names all of them. Such a table may have a part in each
-    row: if its first column has 2 to 12 different words, all whole numbers, it is named `class`,
-    before `x*`.
+    too many, and this is empty or the `Comment` of LabVIEW, it is left out. Without a header, or if
+    it has another number of cells than there are columns, the names are `c0`, `c1`, ...; for 20
+    columns or more it is `x*`, which names all of them. Such a table may have a part in each row:
+    if its first column has 2 to 12 different words, all whole numbers, it is named `class`, before
+    `x*`.
 
     usual : how a typical file is written, and the cells of its samples.
     """
@@ -313,7 +314,7 @@ def _column_names(usual: Look) -> Strings:
         return []
     if usual.is_closed and len(cells) == width - 1:
         return header_names([*cells, ""])
-    if len(cells) == width + 1 and usual.form.delimiter != BLANK and not any(map(is_unit, cells)):
+    if len(cells) == width + 1 and cells[width].strip().lower() in ("", "comment"):
         return header_names(cells[:width])
     if width < MOST_NAMES:
         return [f"c{i}" for i in range(width)]

@@ -30,8 +30,8 @@ def cut(table: Table, description: Description, base: Path) -> Iterator[Table]:
     `path` of a part's table is the number of the part from 1, or its key in the listing. A part has
     `damage` (an error for which it is left out) if a trigger begins it in a gap of the times, or if
     a window of the listing has no samples, overlaps an earlier one, or goes beyond the recording.
-    If the labels are a topic of a ROS bag, that column has the different labels between the start
-    of the part and the start of the next: several, which are no label, may be those of two parts.
+    If the labels are a topic of a ROS bag, that column has the labels between the start of the part
+    and the start of the next: if they differ, they may be those of two parts.
     Raises DataError if `time.column` is not stated, if a trigger cuts and the rate is not stated,
     if no part is found, if the recording has damage, or if times, signals, labels or the listing
     cannot be read, SettingError for a malformed trigger, and LookupError for a listing in an
@@ -53,7 +53,7 @@ def cut(table: Table, description: Description, base: Path) -> Iterator[Table]:
     for (key, rows, fault), end in zip(windows, ends, strict=True):
         part = table.take(rows)
         verdicts = {
-            topic: pd.Series(table.column(topic)[rows.start : end]).dropna().unique()
+            topic: pd.Series(table.column(topic)[rows.start : end]).dropna().to_numpy()
             for topic in verdicts_of(description)
         }
         yield replace(
