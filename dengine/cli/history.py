@@ -221,7 +221,6 @@ def _event_line(item: StoredVersion | Event) -> str:
     """
     from ..store.records import Event
 
-    time_text = format_time(item.time, SHORT_TIME)
     if isinstance(item, Event):
         text = f"{item.kind}: {' '.join(item.text.split())}"
     else:
@@ -231,7 +230,7 @@ def _event_line(item: StoredVersion | Event) -> str:
             title = f"retrain to version {report.version}"
         duration = format_duration(report.seconds)
         text = f"{title}, {report.n_traces} traces, {duration}: {report.reason}"
-    line = f"{time_text}  * {text}"
+    line = f"{format_time(item.time, SHORT_TIME)}  * {text}"
     return line if len(line) <= TABLE_WIDTH else f"{line[: TABLE_WIDTH - 3]}..."
 
 

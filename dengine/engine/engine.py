@@ -665,7 +665,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
             if stored.quarantined:
                 return None
             # Last, since it may take its budget.
-            return self._learner.retrain_if_due(self.recipe.retrain_every)
+            return self._learner.retrain_if_due(self._settings.now.recipe.retrain_every)
 
     def run(self, cell: Cell, cycles: int) -> Iterator[Cycle]:
         """Drive a robot cell, and yield a record of each cycle as it happens.

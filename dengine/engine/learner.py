@@ -304,7 +304,7 @@ class Learner:
     @property
     def is_at_work(self) -> bool:
         """Whether a training is under way in the executor, or its version is not in force yet."""
-        return self._retrainer.future is not None or self.is_swapping
+        return self._retrainer.future is not None or self._candidate is not None
 
     @property
     def is_busy(self) -> bool:
