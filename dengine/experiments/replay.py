@@ -439,7 +439,7 @@ def to_replay(observed: Sequence[ObservedCycle], recipe: Recipe) -> Replay:
         for name, dtype in DECISION_FIELDS.items()
     }
     return Replay(
-        truth=np.array([truth for _, truth in observed]),
+        truth=np.array([truth for _, truth in observed], dtype=np.float64),
         position=_positions(decisions),
         decide_seconds=np.array([cycle.decide_seconds for cycle in cycles]),
         stopped=np.array([cycle.outcome is Outcome.STOPPED for cycle in cycles], dtype=np.bool_),

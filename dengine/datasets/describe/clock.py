@@ -130,17 +130,18 @@ def is_clock(column: Column) -> bool:
     """Return whether a column may hold the times of the samples.
 
     The result is True for dates and times of day that change within a recording. It is also True
-    for a column that is named like a clock (`time`, `stamp`, `t`, ...) or has a unit of time, if
-    not all its cells are numbers and they change within a recording, or if all are numbers that
-    rise and it has no unit of another quantity, like N. Numbers count as rising if they fall in at
-    most 10 % of the steps, like a counter that begins again, or in at least 90 %, if the newest row
-    is the first. Raises UnreadableError if cells are lists.
+    for a column that is named like a clock (`time`, `stamp`, `t`, ...), if not all its cells are
+    numbers and they change within a recording. If all are numbers, they must rise, and the column
+    must have a unit of time, or be named like a clock without a unit of another quantity, like N.
+    Numbers count as rising if they fall in at most 10 % of the steps, like a counter that begins
+    again, or in at least 90 %, if the newest row is the first. Raises UnreadableError if cells are
+    lists.
     """
     is_named = CLOCK_NAME.search(column.name)
     if column.forms or (is_named and column.odd):
         return not column.fixed
-    may_be = column.unit not in UNITS if is_named else column.unit in TIME_UNITS
-    if not may_be or column.odd or not column.usual_step:
+    unit_fits = column.unit not in UNITS if is_named else column.unit in TIME_UNITS
+    if not unit_fits or column.odd or not column.usual_step:
         return False
     falls = (column.steps < 0).mean()
     return bool(min(falls, 1 - falls) <= FEW)

@@ -100,7 +100,8 @@ def look(content: bytes, stated: Stated) -> Look:
         header = next(found, header)
     title = "".join(lines[header - 1 : header])
     if isinstance(beginning, int):
-        header, title = beginning, ""  # the line may differ from file to file
+        header = beginning
+        title = ""  # the line may differ from file to file
     form = TextForm(encoding, delimiter, header=header, units=units, data=data + 1)
     return Look(form, width, title, rows[data:], is_closed)
 

@@ -25,7 +25,7 @@ from .split import signals_of, verdicts_of
 BAG = ".mcap"  # suffix
 STAMP = "stamp"
 LOG_TIME = "log_time"
-SECOND = 10**9  # in nanoseconds
+SECOND = 1_000_000_000  # in nanoseconds
 PLACE = "place"
 TOPIC = re.compile("/[^.]*")  # with a field behind a point it is a channel
 
