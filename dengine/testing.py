@@ -147,8 +147,8 @@ def labels_come_only_where_it_says_that_it_uses_them(reducer: Any) -> None:
 
     A transformer that is no `Reducer` must have scikit-learn's tag `target_tags.required` instead.
     Otherwise an engine would pass no labels, and every retrain would fail. Clones are fitted to
-    test traces, so `reducer` stays unchanged. If `fit` fails with labels as well, its error is
-    raised unchanged. A reducer that uses labels passes.
+    test traces, so `reducer` stays unchanged. A reducer that says that it uses labels passes. If
+    the `fit` of any other fails with labels as well, its error is raised unchanged.
     """
     X, y = toy_traces()
     traces = X if isinstance(reducer, Reducer) else X[:, 0]

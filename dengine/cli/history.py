@@ -216,8 +216,8 @@ def _event_line(item: StoredVersion | Event) -> str:
 
     The line of a retrain also has the number of traces and the duration; it names the version of
     the model that came into use, or, if the retrain was dropped (its model is not used), the number
-    of the retrain. The text of an event is put on one line. "..." ends a line that is cut, at 120
-    characters.
+    of the retrain. The text of an event is put on one line. A longer line is cut to 120 characters,
+    of which the last three are "...".
     """
     from ..store.records import Event
 

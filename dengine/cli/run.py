@@ -299,7 +299,8 @@ def _robot_cell(source: DataChoice, host: str | None, **others: Any) -> CellToDr
     controller at `host`, HOST or HOST:PORT. The options of `source` say what is recorded, and when;
     `others` are settings of other kinds of robot cell, and are ignored. The function takes the
     engine, which it ignores, and returns the cell and its name. The cell's `close` ends the
-    connection. The robot comes first, because a store that is made for it keeps its settings.
+    connection. It is connected before a store is made, because a new store keeps the settings that
+    it is made with.
 
     Raises
     ------

@@ -156,7 +156,7 @@ class Channel:
 
 
 def _check_path(path: str, key: str) -> None:
-    """Raise DataError unless a text is a regular expression with one group, empty, or `?`.
+    """Raise DataError unless `path` is "", `?`, or a regular expression with one group.
 
     key : what the text is the value of, for the message.
     """

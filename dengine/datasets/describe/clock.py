@@ -90,7 +90,7 @@ def propose_clock(p: Proposal) -> None:
 
 
 def likely_clocks(columns: Sequence[Column]) -> list[Column]:
-    """Return the columns that may tell the time (`is_clock`) by cells or name, else by their unit.
+    """Return the columns that may be a clock (`is_clock`) by cells or name or, if none is, by unit.
 
     Raises UnreadableError if cells are lists.
     """
@@ -131,11 +131,10 @@ def is_clock(column: Column) -> bool:
 
     The result is True for dates and times of day that change within a recording. It is also True
     for a column that is named like a clock (`time`, `stamp`, `t`, ...), if not all its cells are
-    numbers and they change within a recording. If all are numbers, they must rise, and the column
-    must have a unit of time, or be named like a clock without a unit of another quantity, like N.
-    Numbers count as rising if they fall in at most 10 % of the steps, like a counter that begins
-    again, or in at least 90 %, if the newest row is the first. Raises UnreadableError if cells are
-    lists.
+    numbers and they change within a recording. A column of numbers must rise; it needs a unit of
+    time, or the name of a clock and no unit of another quantity, like N. Numbers that change count
+    as rising if they fall in at most 10 % of the steps, like a counter that begins again, or in at
+    least 90 %, if the newest row is the first. Raises UnreadableError if cells are lists.
     """
     is_named = CLOCK_NAME.search(column.name)
     if column.forms or (is_named and column.odd):

@@ -32,9 +32,9 @@ def layout_of(p: Proposal, files: Tables) -> str:
     which the first has one row, are `files` (a part in each), unless this row has 20 or more
     columns like `x0`, `x1`. Such columns (unless a clock with equal steps stands beside them, see
     `is_even_clock`), or lists of two items or more in the first row of the first table, make it
-    `wide` (a part in each row), or `npz` for an .npz file; but if no header names the columns, so
-    that `x*` was made up, such columns give `?`, with a note. It is `long` (a sample in each row)
-    if a column of the first table may tell the parts apart (`may_tell_parts`), or if a file has
+    `wide` (a part in each row), or `npz` for an .npz file; but if `text.names` is `x*` alone, for
+    no header names the columns, they give `?`, with a note. It is `long` (a sample in each row) if
+    a column of the first table may tell the parts apart (`may_tell_parts`), or if a file has
     several words in a stated `part.column`, the column that tells the parts apart. Several files,
     of which `p.names` may have more than were looked at, are `files`. A single one gives `?`, with
     a note on what to state.

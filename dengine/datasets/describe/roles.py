@@ -309,11 +309,11 @@ def _other_scales(p: Proposal) -> Iterator[str]:
     """Yield a text for each column or line above the header that shows another scale.
 
     It is named like a unit, a factor or a rate, or all its words are units, or numbers with one,
-    and come twice on average; its word is not the same in all recordings. If it is the same, the
-    column or line must be named like a factor, and the word a number other than 1. Recordings in
-    which it is missing, empty or changes are ignored. The columns are those without a role (such as
-    channel, clock or label), and the lines are those of the first table. Raises SettingError for a
-    malformed `windows.trigger`.
+    and come twice on average; its word is not the same in all recordings. A word that is the same
+    in all recordings counts only if it is a number other than 1 and the name is like that of a
+    factor. Recordings in which it is missing, empty or changes are ignored. The columns are those
+    without a role (such as channel, clock or label), and the lines are those of the first table.
+    Raises SettingError for a malformed `windows.trigger`.
     """
     for source in sources_named(p, ANY_NAME, ANY_NAME):
         name = source.line or source.column[0]

@@ -78,8 +78,9 @@ def look(content: bytes, stated: Stated) -> Look:
     does not know.
 
     stated : keys that the user gave. `text.encoding` and `text.delimiter` are taken, and so is
-    `text.header` if it is a text, with which the header begins, unless no line above the samples
-    begins with it. With any `text.header`, also a number, a doubt about the header is no error.
+    `text.header`: a text selects the first line above the samples that begins with it, if there is
+    one, and a number is taken as the line of the header, whose text is then "", since it may differ
+    from file to file. With any `text.header`, also a number, a doubt about the header is no error.
     """
     encoding, text = decode(content, stated.get("text.encoding", ""))
     lines = text.rstrip("\n").split("\n")
@@ -300,12 +301,11 @@ def _column_names(usual: Look) -> Strings:
     """Return the names of columns for `text.names`; empty if the header names each column.
 
     `#` or `%` at the beginning of the header is skipped. If it lacks the last column, and this is
-    empty in all rows, the names are those of the header and one like `column3`. If it has one name
-    too many, and this is empty or the `Comment` of LabVIEW, it is left out. Without a header, or if
-    it has another number of cells than there are columns, the names are `c0`, `c1`, ...; for 20
-    columns or more it is `x*`, which names all of them. Such a table may have a part in each row:
-    if its first column has 2 to 12 different words, all whole numbers, it is named `class`, before
-    `x*`.
+    empty in all rows, the names are those of the header and one like `column3`. One name too many
+    at the end is left out if it is empty or LabVIEW's `Comment`. Without a header, or if it has
+    another number of cells than there are columns, the names are `c0`, `c1`, ...; for 20 columns or
+    more it is `x*`, which names all of them. Such a table may have a part in each row: if its first
+    column has 2 to 12 different words, all whole numbers, it is named `class`, before `x*`.
 
     usual : how a typical file is written, and the cells of its samples.
     """

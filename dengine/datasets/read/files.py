@@ -140,15 +140,16 @@ def suffix_of(name: str) -> str:
 
 
 def names_in(root: Path, patterns: Strings) -> Strings:
-    """Return the files of a folder that may be recordings, as relative paths, by their names.
+    """Return a folder's files that may be recordings: relative paths in the order of `file_key`.
 
-    Hidden files, files in hidden folders or outside of the folder (`../x.csv`), `recordings.toml`,
-    and files like README or LICENSE are left out. Without `patterns`, only files with a suffix of
-    recordings, like .csv or .json, are returned. If `root` is a file, the list has only its name.
-    If nothing is there, the list is empty. Raises DataError for a malformed pattern, unless `root`
-    is a file.
+    Left out are hidden files and folders, files outside of the folder (`../x.csv`),
+    `recordings.toml`, and files like README or LICENSE. Without `patterns`, only files with a
+    suffix of recordings, like .csv or .json, are returned. If `root` is a file, the list has only
+    its name. If nothing is there, the list is empty. Raises DataError for a malformed pattern,
+    unless `root` is a file.
 
-    patterns : patterns of the files, like `*.csv`; empty: all files below the folder.
+    patterns : patterns of the files, like `*.csv`; empty: all files below the folder with such a
+    suffix.
     """
     if root.is_file():
         return [root.name]
@@ -189,7 +190,7 @@ def unread_note(source: Any, description: Description) -> str:
 
     They have a suffix of recordings, like .csv or .json (`names_in`), match neither `files` nor
     `exclude`, and are no listing that the description names. There are none in a source that is no
-    folder.
+    folder. Raises DataError for a malformed pattern.
     """
     if not isinstance(source, Path) or source.is_file():
         return ""

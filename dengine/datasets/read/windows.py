@@ -30,12 +30,11 @@ def cut(table: Table, description: Description, base: Path) -> Iterator[Table]:
     `path` of a part's table is the number of the part from 1, or its key in the listing. A part has
     `damage` (an error for which it is left out) if a trigger begins it in a gap of the times, or if
     a window of the listing has no samples, overlaps an earlier one, or goes beyond the recording.
-    If the labels are a topic of a ROS bag, that column has the labels between the start of the part
-    and the start of the next: if they differ, they may be those of two parts.
-    Raises DataError if `time.column` is not stated, if a trigger cuts and the rate is not stated,
-    if no part is found, if the recording has damage, or if times, signals, labels or the listing
-    cannot be read, SettingError for a malformed trigger, and LookupError for a listing in an
-    encoding that Python does not know.
+    For labels in a topic of a ROS bag, that column has all labels from the start of the part to the
+    start of the next; different ones may belong to two parts. Raises DataError if `time.column` is
+    not stated, if a trigger cuts and the rate is not stated, if no part is found, if the recording
+    has damage, or if times, signals, labels or the listing cannot be read, SettingError for a
+    malformed trigger, and LookupError for a listing in an encoding that Python does not know.
     """
     import pandas as pd
 
