@@ -242,24 +242,29 @@ def _simulated_cell(scenario: str, cycles: int, source: DataChoice, **others: An
     return spec, make
 
 
-def _replay_cell(source: DataChoice, cycles: int, **others: Any) -> CellToDrive:
+def _replay_cell(source: DataChoice, cycles: int, host: str | None, **others: Any) -> CellToDrive:
     """Return the `TraceSpec` of a recording, and a function that makes a robot cell which plays it.
 
     A `TraceSpec` says what shape, rate and unit traces have. The recording is the data set of
     `source`, and is loaded at once. The function takes the engine, and returns the cell and its
-    name. SettingError is raised for more `cycles` than parts. The cell begins after the last part
-    that was played before. A part was played before if
-    its trace equals one that has a label of this cell in the store (but no label that a person
-    withdrew, and no trace with a fault), or that of this cell's newest accepted part without a
-    report. Making the cell raises SettingError if fewer parts than `cycles` are left, and
-    StoreError if the store cannot be read or the trace of that accepted part is damaged. `others`
-    are ignored. Raises the errors of `DataChoice.load`.
+    name. click.UsageError is raised for a `host`, or if `source` has an option of live traces, and
+    SettingError for more `cycles` than parts. The cell begins after the last part that was played
+    before. A part was played before if its trace equals one that has a label of this cell in the
+    store (but no label that a person withdrew, and no trace with a fault), or that of this cell's
+    newest accepted part without a report. Making the cell raises SettingError if fewer parts than
+    `cycles` are left, and StoreError if the store cannot be read or the trace of that accepted part
+    is damaged. `others` are ignored. Raises the errors of `DataChoice.load`.
     """
     import numpy as np
 
     from ..cells.replay import ReplayCell
     from ..folds import content_hash
 
+    if host or source.options.keys() - {"channels", "samples"}:
+        raise click.UsageError(
+            "--cell replay takes rate, unit and length from the recordings; --host, --trigger, "
+            "--rate-hz, --unit and --fit are for --cell ur or simulated."
+        )
     dataset = source.load()
     expect(cycles <= len(dataset), f"--cycles of at most {len(dataset)}", cycles)
 
