@@ -115,7 +115,7 @@ MEASURES = {
         "Bad parts accepted",
         1,
         "Parts per replay that were accepted and were bad. Fewer is better. A method that decides "
-        "little also accepts few bad parts, so read this table beside that of the certain "
+        "little also accepts few bad parts, so read this table beside the table of certain "
         "decisions.",
         False,
     ),
@@ -339,10 +339,10 @@ def introduction_lines() -> list[str]:
         "**A replay** sends the parts of one "
         "[set](../explanation/reducers.md#what-each-reducer-gives) through an engine, one after "
         "the other. The "
-        "engine starts without a label. It either decides a part itself, which is a *certain* "
-        "decision, or has it checked and learns from the result. From an accepted part it learns "
-        "only if the part stopped the line. The seed sets the order of the parts of a recorded "
-        "set. The parts of a generated set are generated from the seed.",
+        "engine starts without a label. It decides a part itself, which is a *certain* decision, "
+        "or it has the part checked and learns from the result. From an accepted part it learns "
+        "only if the part stopped the line. The seed shuffles the parts of a set, or generates "
+        "them.",
         "",
         "**The methods.** " + ", ".join(f"`{method}`" for method in REDUCERS) + " are reducers of "
         "dengine. The other names are published methods, which decide and learn in the same "
@@ -359,9 +359,9 @@ def introduction_lines() -> list[str]:
         f"`{REFERENCE}` on the same parts in the same order (the same seed). In brackets is the "
         "95 % interval of this difference (Student's t over the seeds). The difference is **bold** "
         "if the interval does not contain zero. Each interval holds by itself: of 100 methods that "
-        f"are exactly as good as `{REFERENCE}`, about five would be bold. A method with fewer "
-        f"seeds is compared only with the replays of `{REFERENCE}` that have these seeds. So this "
-        "difference may not be the difference of the two means in the table.",
+        f"are exactly as good as `{REFERENCE}`, about five would have a bold difference. A method "
+        f"with fewer seeds is compared only with the replays of `{REFERENCE}` that have these "
+        "seeds. So this difference may not be the difference of the two means in the table.",
         "",
     ]
 
@@ -470,8 +470,8 @@ def figure_lines() -> list[str]:
         "",
         "![Learning curves of each method on each set](curves.png)",
         "",
-        f"Each point covers the parts during which the engine got {LABELS_PER_POINT} labels, at "
-        f"{policy}. It shows the share of these parts that were decided without a check. If a "
+        f"Each point covers a stretch of parts in which the engine got {LABELS_PER_POINT} labels, "
+        f"at {policy}. It shows the share of these parts that were decided without a check. If a "
         "curve ends further left, the method needed fewer labels for all parts of the set.",
         "",
         f"### Net seconds beside {REFERENCE}",
@@ -530,8 +530,8 @@ def paper_lines(replays: pd.DataFrame) -> list[str]:
             lines += [paper_table(played, reducer, interval), ""]
     lines += [
         "Each line says whether these replays confirm a finding of the paper. Then come the "
-        "finding, the method and what was measured. A *cell* is here a cell of the tables, that "
-        "is a combination of alpha and LB.",
+        "finding, the method and what was measured. Here a *cell* is a cell of the tables: a "
+        "combination of alpha and LB.",
         "",
     ]
     return [*lines, *(f"- {line}" for line in findings(rows)), ""]
@@ -579,9 +579,9 @@ def guarantee_lines(played: pd.DataFrame) -> list[str]:
     return [
         "## What each guarantee saves",
         "",
-        "The table shows `conv` if every bad accepted part stops the line and is known "
-        '(`stops="all"`). `python training/evidence_guarantees.py` played its replays at commit '
-        f"{commits}. {origin} An entry is: **net seconds** / certain decisions / share of the "
+        "The table compares guarantees for `conv`. Every bad accepted part stops the line and is "
+        'known (`stops="all"`). `python training/evidence_guarantees.py` played these replays at '
+        f"commit {commits}. {origin} An entry is: **net seconds** / certain decisions / share of the "
         "accepted parts that were bad. LB 95.8 % is 1 - 5 / 120: if 5 of 120 accepted parts are "
         "bad, accepting costs as much as checking. The two columns on the right need hindsight: "
         "the accept threshold and the reject threshold that save most were chosen afterwards, with "
