@@ -6,6 +6,7 @@ they show what was finished.
 
 from __future__ import annotations
 
+import shlex
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -79,36 +80,34 @@ class Stream:
 
 
 def _play(
-    dataset: Dataset, tasks: Sequence[Task], stream: Stream
+    dataset: Dataset, tasks: Sequence[Task], stream: Stream, advance: Callable[[int], None]
 ) -> tuple[list[PlayedReplay], BaseException | None]:
-    """Play replays with a progress bar; return the finished ones, and what ended the work early.
+    """Play replays; return the finished ones, and what ended the work early.
 
     A replay plays recorded parts through a new engine; each of `tasks` is a replay to be played.
     The finished replays are in the order of their tasks. The error or Ctrl-C that ended the work
-    early (None if nothing did) is not raised: the caller must pass it to `_end`. Of `stream` these
-    are used: the number of processes, the folder of replays that were finished earlier and are not
-    played again, and, only for the length of the bar, the number of parts of a replay.
+    early (None if nothing did) is not raised: the caller must pass it to `_end`. `advance(n)` is
+    called for each n cycles that are played. Of `stream` these are used: the number of processes,
+    and the folder of replays that were finished earlier and are not played again.
     """
     from ..experiments.grid import iterate_replays
 
     played: list[PlayedReplay] = []
     error: BaseException | None = None
-    n_cycles = len(tasks) * (stream.cycles or len(dataset))
-    with progress_bar(f"replaying {dataset.name}", n_cycles) as advance:
-        try:
-            for item in iterate_replays(
-                dataset,
-                tasks,
-                n_jobs=stream.n_jobs,
-                keep=stream.keep,
-                on_cycle=lambda cycle: advance(1),
-            ):
-                played.append(item)
-                # A callback cannot travel to other processes: there the bar moves by whole replays.
-                if stream.n_jobs != 1 or item.kept:
-                    advance(len(item.replay))
-        except (KeyboardInterrupt, Exception) as interruption:  # what was finished is shown first
-            error = interruption
+    try:
+        for item in iterate_replays(
+            dataset,
+            tasks,
+            n_jobs=stream.n_jobs,
+            keep=stream.keep,
+            on_cycle=lambda cycle: advance(1),
+        ):
+            played.append(item)
+            # A callback cannot travel to other processes: there the bar moves by whole replays.
+            if stream.n_jobs != 1 or item.kept:
+                advance(len(item.replay))
+    except (KeyboardInterrupt, Exception) as interruption:  # what was finished is shown first
+        error = interruption
     return sorted(played), error
 
 
@@ -337,7 +336,9 @@ def _replay_and_print(
         contenders, seeds=stream.seeds, cycles=stream.cycles, shuffle=stream.shuffle, **grid
     )
     begin = time.perf_counter()
-    played, error = _play(dataset, tasks, stream)
+    n_cycles = len(tasks) * (stream.cycles or len(dataset))
+    with progress_bar(f"replaying {dataset.name}", n_cycles) as advance:
+        played, error = _play(dataset, tasks, stream, advance)
     finished = f"{len(played)} of {len(tasks)} replays were finished"
     if not played:
         _end(error, f"{finished}; there is nothing to show.", False)
@@ -433,9 +434,10 @@ CAPTION = (
     "below it a 95 % interval, with the luck of the recordings and of the order. late: over the "
     "last third of a shuffle, when something has been learned. verified: share of the parts that "
     "were checked. bad of accepted, good of rejected: over these shuffles, with their intervals "
-    "below. The choice, >, is the cheapest, or one that lets fewer bad parts through and is not "
-    "dearer beyond chance. All shuffles play the same parts: only parts that are recorded later "
-    "are a clean test."
+    "below. The choice, >, is the cheapest, or a safer one that is not dearer beyond chance: the "
+    "guarantee cost, or one that lets fewer bad parts through. All shuffles play the same parts: "
+    "only parts that are recorded later are a clean test. Shuffles also hide drift, which "
+    "dengine replay --in-order shows."
 )
 COLUMNS = ("rule", "LB", "cost", "late", "verified", "bad of\naccepted", "good of\nrejected")
 CURVE_FIELDS = (
@@ -527,23 +529,24 @@ def costs(
     error: BaseException | None = None
 
     def play(tasks: Sequence[Task]) -> list[Replay]:
-        """Play tasks with a progress bar; return the finished replays in the order of the tasks,
-        and keep what interrupted them in `error`, None if nothing did.
+        """Play tasks; return the finished replays in the order of the tasks, and keep what
+        interrupted them in `error`, None if nothing did.
         """
         nonlocal error
-        played, error = _play(dataset, tasks, stream)
+        played, error = _play(dataset, tasks, stream, advance)
         return [item.replay for item in played]
 
-    curve = find_policy(
-        dataset,
-        choice.make_contender(),
-        Costs(**part_prices),
-        play,
-        repeats=len(stream.seeds),
-        seed=stream.seeds[0],
-        cycles=stream.cycles,
-        **lists,
-    )
+    with progress_bar(f"replaying {dataset.name}, cycles", None) as advance:
+        curve = find_policy(
+            dataset,
+            choice.make_contender(),
+            Costs(**part_prices),
+            play,
+            repeats=len(stream.seeds),
+            seed=stream.seeds[0],
+            cycles=stream.cycles,
+            **lists,
+        )
     if curve is None:
         _end(error, "too little was finished; there is nothing to show.", False)
         return
@@ -568,8 +571,10 @@ def costs(
             name: getattr(curve.policy, name)
             for name in ("guarantee", "alpha", "audit_rate", "stops")
         }
-        record["command"] = f"dengine policy {store} {_as_flags(settings | kept)}"
-        command = " \\\n    ".join(wrap(record["command"], 72, break_on_hyphens=False))
+        record["command"] = f"dengine policy {shlex.quote(store)} {_as_flags(settings | kept)}"
+        command = " \\\n    ".join(
+            wrap(record["command"], 72, break_on_hyphens=False, break_long_words=False)
+        )
         lines.append(f"Set it by\n  {command}\n  {record['python']}")
     frame = curve.to_frame()
     print_result(
@@ -607,10 +612,13 @@ def _curve_lines(curve: CostCurve, dataset: Dataset) -> Iterator[str]:
     yield curve.price_sentence
     repeats = survey_dataset(dataset).duplicates
     if repeats:
-        yield f"Of the recordings {repeats:,} repeat another: the interval is too narrow."
+        yield (
+            f"Of the recordings {repeats:,} repeat another: remove them, because the cost is too "
+            "low and its interval too narrow."
+        )
     by_shuffles = [f"{policy_name(row.policy)} {amount(row.cost)}" for row in curve.left_behind]
     if by_shuffles:
-        yield f"Left behind by the first shuffles: {', '.join(by_shuffles)}."
+        yield f"Left behind by other shuffles, at costs of these: {', '.join(by_shuffles)}."
     if curve.out_of_reach:
         yield f"Not tried: {'; '.join(curve.out_of_reach)}."
 

@@ -5,7 +5,6 @@ that follow from them. The recipe, the store's settings and the verb `dengine po
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from typing import TYPE_CHECKING, Any, Literal, Self, get_args
@@ -35,6 +34,7 @@ OLD_NAME = "windows"  # of the force limits, in recipes and stores of before
 # Squared, it is finite in float32, so that a query's own part, infinitely far, is never within it.
 LARGEST_RADIUS = 1e18
 PRICES = (5.0, 120.0, 47.5)  # seconds: the paper's check, a line stop, and the paper's cycle
+MOST_CHECKS = 1e6  # that an error may cost
 AUDIT_RATE = 0.05  # that prices without a guarantee imply
 
 
@@ -79,8 +79,8 @@ class Policy:
         The prices of a check, of a bad part that is accepted (an escape), and of a good part that
         is rejected, in one unit. "cost" decides by them. It accepts a part that fails with a
         probability below check / escape, and rejects a part that succeeds with a probability below
-        check / false reject. An error must cost more than two checks. None: `PRICES`, 5, 120 and
-        47.5.
+        check / false reject. An error must cost more than two checks, and at most a million. None:
+        `PRICES`, 5, 120 and 47.5.
 
     Raises
     ------
@@ -188,15 +188,16 @@ class Policy:
         """Return the prices of a check, a bad accepted part and a good rejected part, as floats.
 
         Raises SettingError if `prices` is no tuple or list of three finite numbers above 0, or if
-        one of the two errors costs no more than two checks.
+        one of the two errors costs no more than two checks, or more than a million.
         """
         given = self.prices if isinstance(self.prices, tuple | list) else ()
         prices = [float(price) for price in given if is_number(price)]
         is_valid = len(prices) == len(given) == 3
-        is_valid = is_valid and 0.0 < 2.0 * prices[0] < min(prices[1:]) and max(prices) < math.inf
+        is_valid = is_valid and 0.0 < 2.0 * prices[0] < min(prices[1:])
+        is_valid = is_valid and max(prices) <= MOST_CHECKS * prices[0]
         expect(
             is_valid,
-            "prices of a check, an escape and a false reject, errors above two checks",
+            "prices of a check, an escape and a false reject, errors of 2 to 1,000,000 checks",
             self.prices,
             "as in 5,120,47.5",
         )

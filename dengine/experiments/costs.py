@@ -106,12 +106,21 @@ class PolicyCost:
         return self.accepted * self.bad.rate if self.bad.decided else 0.0
 
     @property
-    def screening_key(self) -> tuple[bool, float]:
-        """Key by which the halving sorts policies: (whether nothing was decided, expected cost).
+    def limits_loss(self) -> bool:
+        """Whether the policy has the guarantee "cost".
 
-        Policies that verified every part come last, and among the others the cheapest first.
+        Wrong decisions then cost at most two false accepts more than the checks that were saved,
+        for any recordings; with audits by an estimate without bias.
         """
-        return self.accepted + self.rejected == 0.0, self.expected_cost
+        return self.policy.guarantee == "cost"
+
+    @property
+    def screening_key(self) -> tuple[bool, bool, float]:
+        """Key by which the halving sorts policies: the cheapest by expected cost first.
+
+        The guarantee "cost" comes before all others, and policies that verified every part last.
+        """
+        return not self.limits_loss, self.accepted + self.rejected == 0.0, self.expected_cost
 
 
 @dataclass(frozen=True, slots=True)
@@ -196,8 +205,9 @@ class CostCurve:
         The verdict is "may pay" if the policy is cheaper than checking every part, but the interval
         of its cost does not show this yet. One need is given in three units: how many different
         accepted parts in all (those seen included), how many recordings beside the present ones, or
-        how many parts of production without any recordings would show it. In production only parts
-        whose outcome is asked for count: each part if the policy has stops "all" (every bad
+        how many parts of production without any recordings would show it, if as large a share of
+        them is accepted as in one shuffle. In production only parts whose outcome is asked for
+        count: each part if the policy has stops "all" (every bad
         accepted part stops the line and is reported), otherwise the audited share (parts that are
         checked at random although the model is certain), which is taken as 5 % (`AUDIT_RATE`) if
         the policy has no audits. It is assumed that the shares of wrong decisions stay as they were
@@ -210,9 +220,9 @@ class CostCurve:
         errors = (row.bad, row.good)
         rates = [error.wrong / max(1, error.decided) for error in errors]
         # Wilson's upper end u of a share r of n parts: n = z^2 u (1 - u) / (u - r)^2. For r = 1 it
-        # is 1 for any n: then each part counts.
+        # is 1 for any n: then each part counts. More shuffles narrow it, but bring no other parts.
         sizes = [
-            Z**2 * error.upper * (1.0 - error.upper) / (error.upper - rate) ** 2
+            min(error.traces, Z**2 * error.upper * (1.0 - error.upper) / (error.upper - rate) ** 2)
             if rate < 1.0
             else error.traces
             for error, rate in zip(errors, rates, strict=True)
@@ -236,11 +246,17 @@ class CostCurve:
         audit_rate = 1.0 if row.policy.stops == "all" else row.policy.audited_share or AUDIT_RATE
         if n == most:
             return None
+        # Parts that one recording stands for: several shuffles accept more parts than one does.
+        weight = max(
+            size / share / self.cycles
+            for size, share in zip(sizes, (row.accepted, row.rejected), strict=True)
+            if share
+        )
         return Missing(
             accepted=math.ceil(sizes[0] * n / self.cycles),
             seen=round(sizes[0]),
             recordings=n - self.cycles,
-            production=math.ceil(n / audit_rate),
+            production=math.ceil(n * weight / audit_rate),
             audit_rate=audit_rate,
         )
 
@@ -267,15 +283,20 @@ class CostCurve:
         if row.verified == 1.0:
             text = f"Nothing pays: {verify_all}, and everything was verified. Record more."
         elif self.policy is None:
+            yet = " yet" if row.lower < self.costs.check else ""
             text = (
-                f"Nothing pays: {verify_all}; the cheapest policy, {policy_name(row.policy)}, "
+                f"Nothing pays{yet}: {verify_all}; the cheapest policy, {policy_name(row.policy)}, "
                 f"costs {cost}, or {amount(row.expected_cost)} with half an error more."
             )
         elif cheapest != row:
+            why = "the cost guarantee limits what errors may cost"
+            if not row.limits_loss:
+                few, many = (f"{1000 * each.escaped:.2g}" for each in (row, cheapest))
+                why = f"of 1,000 parts it lets {many} bad ones through, not {few}"
+            other = capitalized(policy_name(cheapest.policy))
             text += (
-                f" {policy_name(cheapest.policy)} costs {amount(cheapest.cost)}, which is not "
-                "cheaper beyond chance, and lets more bad parts through: of 1,000 parts "
-                f"{1000 * cheapest.escaped:.2g}, not {1000 * row.escaped:.2g}."
+                f" {other} costs {amount(cheapest.cost)}, which is not cheaper beyond chance, and "
+                f"{why}."
             )
         if missing is not None:
             how = "where every bad accepted part stops the line"
@@ -301,8 +322,8 @@ class CostCurve:
         It lists `price_changes`, or says that the choice stays if there are none.
         """
         if not self.price_changes:
-            return "If one price is half or twice as large, the choice stays."
-        return f"The choice depends on the prices: {'; '.join(self.price_changes)}."
+            return "If one price is half or twice as large, the choice between these rows stays."
+        return f"The choice between these rows depends on: {'; '.join(self.price_changes)}."
 
     def to_frame(self) -> "pd.DataFrame":
         """Return a DataFrame with a row for each policy that was played.
@@ -669,7 +690,7 @@ def _within_reach(
             continue
         n_needed = needed_parts(policy)
         if n_needed > n_good:
-            parts = "accepted parts without a bad one"
+            parts = "checked parts without a bad one"
             if policy.guarantee == "local":
                 parts = "good neighbours"
             out_of_reach.append(
@@ -782,28 +803,27 @@ def _choose(groups: Groups, costs: Costs) -> tuple[list[PolicyCost], PolicyCost,
     `groups` has each policy (settings of the rule that decides) with its replays. The rows are
     sorted by mean cost; among equal costs the row with fewer bad accepted parts comes first, then
     the row whose policy has the higher lower bound (the success probability that accepted parts
-    must have). The best row is the first, unless some rows accept fewer bad parts, are not dearer
-    than the first at a one-sided level of 5 %, and have an expected cost (with half an error added
-    to each share of errors) below the price of a check: then it is the row of these with the
-    fewest. The verdict is "does not pay" if the mean or the expected cost of the best row is not
-    below that price. Otherwise it is "pays" if the whole interval of its cost is below that price,
-    else "may pay".
+    must have). A row is good if it is not dearer than the first at a one-sided level of 5 %, and
+    its expected cost (with half an error added to each share of errors) is below the price of a
+    check. Of the guarantee "cost", whose errors may cost little more than checks (`limits_loss`),
+    the mean cost counts in place of the expected one. The best row is that of the guarantee "cost"
+    if it is good, else the good row with the fewest bad accepted parts. The verdict is "does not
+    pay" if no row is good; the best row is the first one then. Otherwise it is "pays" if the whole
+    interval of the best row's cost is below the price of a check, else "may pay".
     """
     rows = [_policy_cost(policy, replays, costs) for policy, replays in groups.items()]
     rows.sort(key=lambda row: (row.cost, row.escaped, -row.policy.lower_bound))
     cheapest = rows[0]
-    marked = cheapest
+    good = []
     for row in rows:
-        if row.escaped < marked.escaped and row.expected_cost < costs.check:
-            mean, error = _difference(groups[row.policy], groups[cheapest.policy], costs)
-            if mean <= error * normal_quantile(2 * ERROR_LEVEL):  # one-sided
-                marked = row
-    verdict = "may pay"
-    if max(marked.expected_cost, marked.cost) >= costs.check:
-        verdict = "does not pay"
-    elif marked.upper < costs.check:
-        verdict = "pays"
-    return rows, marked, verdict
+        mean, error = _difference(groups[row.policy], groups[cheapest.policy], costs)
+        is_close = mean <= error * normal_quantile(2 * ERROR_LEVEL)  # one-sided
+        if is_close and (row.cost if row.limits_loss else row.expected_cost) < costs.check:
+            good.append(row)
+    if not good:
+        return rows, cheapest, "does not pay"
+    marked = min(good, key=lambda row: (not row.limits_loss, row.escaped))
+    return rows, marked, "pays" if marked.upper < costs.check else "may pay"
 
 
 def _chosen_name(row: PolicyCost, verdict: str) -> str:
@@ -838,7 +858,7 @@ def _policy_cost(policy: Policy, replays: Sequence[Replay], costs: Costs) -> Pol
         policy=policy,
         expected_cost=cost_at(_expected_rate(bad), _expected_rate(good)),
         cost=cost,
-        lower=cost - math.hypot(cost - cost_at(bad.lower, good.lower), luck),
+        lower=max(0.0, cost - math.hypot(cost - cost_at(bad.lower, good.lower), luck)),
         upper=cost + math.hypot(cost - cost_at(bad.upper, good.upper), luck),
         late=float(of_parts[:, 2 * of_parts.shape[1] // 3 :].mean()),
         verified=verified,

@@ -83,7 +83,7 @@ def test_no_row_is_cheaper_than_the_marked_one_unless_a_sentence_says_that_this_
     close = curve(lax=[(20, 1), (20, 0), (20, 3), (20, 0)], strict=[(45, 0)] * 4)
     assert close.rows[0].cost < close.marked.cost
     assert close.policy == STRICT
-    assert "alpha 0.5, LB 80 % costs 2, which is not cheaper beyond chance" in close.sentence
+    assert "Alpha 0.5, LB 80 % costs 2, which is not cheaper beyond chance" in close.sentence
 
 
 def test_the_interval_moves_the_errors_to_their_ends_and_adds_the_luck_of_the_order():
@@ -192,9 +192,10 @@ def test_what_decides_nothing_is_refused(name, value, text, make_data):
 def cheaper_by_level(tasks: Sequence[Task]) -> list[Replay]:
     """Replays in which a stricter policy accepts less, and none is wrong."""
     return [
-        played(policy, task.seed, round(100 * policy.lower_bound), 100, 0)
+        played(policy, task.seed, n, 200 - n, 0)
         for task in tasks
         for policy in [task.contender.recipe.policy]
+        for n in [round(100 * policy.lower_bound)]
     ]
 
 

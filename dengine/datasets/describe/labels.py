@@ -63,10 +63,12 @@ PATHS = (  # of verdicts in folders, and at the end or beginning of names
     rf"(?:^|[-_ ./(=+\[\d#（])({WORD})[-_ \d()\]）]*$",
     rf"(?:^|/)({WORD})(?=[-_ ][^/]*$)",
 )
-PLACES = (  # of any words: folders, and the words of a file's name, counted from the end
+# Of any words: folders, their beginnings, and the words of a file's name, counted from the end.
+PLACES = (
     "([^/]+)/[^/]*$",
     "([^/]+)/[^/]*/[^/]*$",
     "([^/]+)/[^/]*/[^/]*/[^/]*$",
+    "(?:^|/)([^-_ /]+)[-_ ][^/]*/[^/]*$",
     "([^-_ /]+)$",
     "([^-_ /]+)[-_ ][^-_ /]*$",
     "([^-_ /]+)[-_ ][^-_ /]*[-_ ][^-_ /]*$",

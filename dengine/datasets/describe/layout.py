@@ -22,6 +22,9 @@ PART_NAME = re.compile(
 NUMBER = re.compile(r"\d+(\.\d+)?(e-?\d+)?(?=[\])]?( ?[\[(][^\d\[(]+[\])])?$)")  # as in `F_0.5 [N]`
 LEAST_NUMBERED = 20  # columns with numbers behind one name that are the samples of a part
 MOST_PARTS = 240
+RESULTS = (  # what a table without curves is told
+    "A row for each part, with its label, but no curve is a table of results: nothing can be read"
+)
 
 
 def layout_of(p: Proposal, files: Tables) -> str:
@@ -75,8 +78,7 @@ def layout_of(p: Proposal, files: Tables) -> str:
         return "files"
     p.notes["layout"] = (
         f"columns, a part in each; or long: part.column is of {listed(columns)}, and with "
-        "time.sort=true if the rows of parts are mixed. A row for each part, with its label, but "
-        "no curve is a table of results: nothing can be read"
+        f"time.sort=true if the rows of parts are mixed. {RESULTS}"
     )
     return UNKNOWN
 
@@ -100,6 +102,7 @@ def _propose_part_column(p: Proposal, columns: Iterable[Column], runs: Sequence[
     note = f"one of {listed(named)}, or several, like {as_option('part.column', named[:2])}"
     if len(p.names) > 1:
         note += "; or layout=files: each file is a part"
+    note += f". {RESULTS}"
     p.put("part.column", *(likely if len(likely) == 1 else (UNKNOWN, note)))
 
 

@@ -24,7 +24,7 @@ from ..read.recordings import is_dropped, kept_rows
 from ..read.split import match_numbered
 from ..table import Table
 from ..units import QUANTITY, is_load
-from .clock import CLOCK_NAME, COUNTER_NAME, is_clock, propose_clock, propose_rate
+from .clock import CLOCK_NAME, is_clock, propose_clock, propose_rate
 from .columns import FORCES, LOST, MOST_WORDS, Column, Proposal, columns_of, counts_of
 from .labels import VERDICT_NAME, lines_of, part_words, propose_label
 from .layout import PART_NAME
@@ -334,10 +334,11 @@ def may_be_channel(column: Column) -> bool:
     """Return whether a column may be a channel, if it has no other use in the description.
 
     It must have at least three different numbers, change within a recording, and be neither times
-    nor a status with a text (`is_status`), nor named like a counter of rows.
+    nor a status with a text (`is_status`), nor a counter, which rises by 1 in each row.
     """
-    is_other = is_clock(column) or COUNTER_NAME.fullmatch(column.name) or is_status(column)
-    return not (is_other or column.fixed) and len(column.counts) - len(column.odd) > 2
+    is_counter = len(column.steps) and (column.steps == 1).all()
+    is_other = is_counter or is_clock(column) or is_status(column) or column.fixed
+    return not is_other and len(column.counts) - len(column.odd) > 2
 
 
 def find_lost(p: Proposal) -> None:

@@ -262,7 +262,8 @@ def propose_form(p: Proposal, contents: Mapping[str, bytes], faults: Faults) -> 
             "exclude",
             UNKNOWN,
             f"are {listed(odd)} recordings of another form? If not, state a pattern, like "
-            f"{as_option('exclude', odd[:2])}; if so, see files",
+            f"{as_option('exclude', odd[:2])}; if so, see files, or, if only names of columns "
+            "differ, state text.header, the number of their line, and text.names",
         )
     _propose_keys(p, [looks[name] for name in same])
     return same

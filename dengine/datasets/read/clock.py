@@ -142,7 +142,7 @@ def check_steps(seconds: Floats, clock: Clock, table: Table) -> None:
     `seconds`, shape (rows,), has the times of the rows of `table`, at least one. No step from one
     to the next may be longer than `clock.gap` steps of the stated rate, `clock.rate_hz`, or
     `clock.gap` mean steps if none is stated. With `clock.gap` 0 steps may have any length, and
-    some, but not all, may be 0; otherwise equal times are refused. The number of steps may differ
+    up to half of them may be 0; otherwise equal times are refused. The number of steps may differ
     by 3 % from the rate times the whole time; without a rate any will do. A single time passes.
     """
     steps = np.diff(seconds)
@@ -151,7 +151,7 @@ def check_steps(seconds: Floats, clock: Clock, table: Table) -> None:
     n = len(steps)
     span = seconds[-1] - seconds[0]
     most = clock.gap / rate if rate else clock.gap * span / max(n, 1)
-    is_bad = steps <= 0 if clock.gap or not span else steps < 0
+    is_bad = steps <= 0 if clock.gap or 2 * (steps > 0).sum() < n else steps < 0
     is_bad |= steps > (most or np.inf)
     if is_bad.any():
         row = int(is_bad.argmax()) + 1
