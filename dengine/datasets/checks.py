@@ -13,7 +13,7 @@ import numpy as np
 from ..errors import DataError, instead, listed, percent
 from ..folds import content_hash
 from .dataset import LEAST_RATE_HZ, MOST_RATE_HZ, Dataset, Fault, Faults, expect_all
-from .description import Clock, Description, TextForm
+from .description import Clock, Description, LabelSource, TextForm
 from .table import Recording
 
 
@@ -24,13 +24,16 @@ def check_description(description: Description) -> None:
     except in `[ignored]` and `[[check]]`. The number of samples of a trace must be 1 or more. There
     must be a channel, and all channels must have the same `limit`, the range of the sensor. If the
     `order` of the parts is "time", there must be a column of times. If recordings with a column of
-    times are resampled, there must be a rate. The settings in `[time]` and `[text]` must be valid,
-    for example name an encoding that Python knows (`check_forms`). Nothing else is checked: neither
-    a trigger (the condition at which a part begins), nor whether columns exist.
+    times are resampled, there must be a rate. A part's number may have one place, and so may
+    labels, whose words must have one meaning each (`is_clear`). The settings in `[time]` and
+    `[text]` must be valid, for example name an encoding that Python knows (`check_forms`). Nothing
+    else is checked: neither a trigger (the condition at which a part begins), nor whether columns
+    exist.
     """
     if open_keys := description.open_keys:
         raise DataError(f"Expected a description without ?, still open: {listed(open_keys)}.")
     limits = {channel.limit for channel in description.channels.values()}
+    places = (description.part.column, description.part.path, description.part.line)
     expect_all(
         {
             "traces.samples, the samples of each trace": description.traces.samples > 0,
@@ -43,9 +46,23 @@ def check_description(description: Description) -> None:
                 or not description.time.column
             ),
             "one limit for all channels": len(limits) == 1,
+            "one place of the part's number in [part]": sum(map(bool, places)) < 2,
+            "one place of the label, and one meaning of each word, in [label] and [[check]]": all(
+                map(is_clear, description.labels)
+            ),
         }
     )
     check_forms(description.time, description.text)
+
+
+def is_clear(source: LabelSource) -> bool:
+    """Return whether labels have one place, or none, and each word one meaning, or none.
+
+    The places are a path, a line, a topic, and a column, which may be that of a listing.
+    """
+    words = source.good + source.bad + source.unchecked
+    places = (source.path, source.line, source.topic, source.column or source.listing)
+    return sum(map(bool, places)) < 2 and len({*words}) == len(words)
 
 
 def check_forms(clock: Clock, text: TextForm) -> None:
@@ -87,24 +104,24 @@ def without_repeats(recordings: Sequence[Recording]) -> tuple[list[Recording], F
 
     The recordings kept stay in their order. All traces must have the same shape (C, T). Two traces
     are equal if they have the same `content_hash`, which rounds samples down to 1/65,536 of their
-    unit, and counts lost samples as 0. Of equal traces with one label the first is kept; if their
-    labels differ, none is kept. This also holds for traces of a dead sensor (all samples are
-    equal), although the engine never trains on them.
+    unit, and counts lost samples as 0. Of equal traces with one label that with the shortest source
+    is kept (the first of several); if their labels differ, none is kept. This also holds for traces
+    of a dead sensor (all samples are equal), although the engine never trains on them.
     """
     hashes = content_hash(np.array([recording.trace for recording in recordings]))
-    groups = defaultdict[int, list[Recording]](list)
-    for hash_, recording in zip(hashes.tolist(), recordings, strict=True):
-        groups[hash_].append(recording)
-    kept = list[Recording]()
-    faults: Faults = []
+    sources = [recording.source for recording in recordings]
+    groups = defaultdict[int, list[int]](list)
+    for i, hash_ in enumerate(hashes.tolist()):
+        groups[hash_].append(i)
+    faults = dict[int, Fault]()
     for group in groups.values():
-        source = group[0].source
-        message = f"Expected one label for the samples of {source}, got two"
-        if len({item.label for item in group}) == 1:
-            message = f"Expected other samples than those of {source}, it repeats them"
-            kept.append(group.pop(0))
-        faults += [Fault(item.source, 0, message) for item in group]
-    return kept, faults
+        first = min(group, key=lambda i: len(sources[i]))  # `x.csv`, not `Copy of x.csv`
+        message = f"Expected one label for the samples of {sources[first]}, got two"
+        if len({recordings[i].label for i in group}) == 1:
+            message = f"Expected other samples than those of {sources[first]}, it repeats them"
+            group.remove(first)
+        faults |= {i: Fault(sources[i], 0, message) for i in group}
+    return [item for i, item in enumerate(recordings) if i not in faults], [*faults.values()]
 
 
 def tolerance_note(data: Dataset, lower_bound: float) -> str:

@@ -11,11 +11,11 @@ everything costs `check` per part. A part that an operator's limits reject costs
 that no policy pays by the limits, which are the same under each.
 
 The candidates are values of LB around break-even, 1 - check / escape, and the guarantees "pooled"
-and "cost". `cost_curve` halves them: all play two shuffles, the cheaper half plays two more, and
-so on. The last two play fresh shuffles, which are all that is reported, so that no figure was
-picked for being small. The early rounds replay one engine that checks every part, and play each
-candidate's rule on its scores (`replay_policy`): in replays of their own, which the last two have,
-they would learn fewer labels.
+and "cost". `cost_curve` halves them: all play two shuffles, the cheaper half plays two more, and so
+on; "cost", which limits what errors cost, is never left behind. The last two play fresh shuffles,
+which are all that is reported, so that no figure was picked for being small. The early rounds
+replay one engine that checks every part, and play each candidate's rule on its scores
+(`replay_policy`): in replays of their own, which the last two have, they would learn fewer labels.
 
 The interval has the luck of the recordings and of the order: the shares of wrong decisions at the
 ends of their intervals, whose unit is the part, and the spread over the shuffles.
@@ -155,11 +155,12 @@ class CostCurve:
     rows : tuple of PolicyCost
         The policies that played the shuffles that are reported, the cheapest first.
     marked : PolicyCost
-        The best of `rows`: the cheapest, or a row that let fewer bad parts through and is not
-        significantly dearer.
+        The best of `rows`: the cheapest, or a safer one that is not significantly dearer, which is
+        the guarantee "cost", or else a row that let fewer bad parts through.
     verdict : str
         "pays" if the whole interval of the marked policy is below the cost of verifying
-        everything, "does not pay" if its mean or its expected cost is not, else "may pay".
+        everything, "does not pay" if its expected cost is not (of the guarantee "cost": its mean),
+        else "may pay".
     price_changes : tuple of str
         What would be chosen of `rows` if one price were half or twice as large, where that is
         something else. Under the guarantee "cost", too, the decisions are those that were played.
@@ -473,12 +474,12 @@ def cost_curve(
     A policy is the settings of the rule that decides. The candidate policies are replayed on
     shuffles, random orders of the recordings. While there are more than two, they play two shuffles
     (on the recorded predictions of one engine that checks every part, unless a baseline plays), and
-    the dearer half (of an odd number the larger half, but of three one) is left behind. Policies
-    that verified every part count as the dearest; all others are compared by their expected cost
-    over all shuffles so far. The last two, or the only one, play fresh shuffles, by which no policy
-    was chosen. A policy with a setting that is refused, like a lower bound out of range, or that
-    needs more good parts than a shuffle has, is not tried; the field `out_of_reach` of the result
-    says so.
+    the dearer half (of an odd number the larger half, but of three one) is left behind. The
+    guarantee "cost" stays. Policies that verified every part count as the dearest; all others are
+    compared by their expected cost over all shuffles so far. The last two, or the only one, play
+    fresh shuffles, by which no policy was chosen. A policy with a setting that is refused, like a
+    lower bound out of range, or that needs more good parts than a shuffle has, is not tried; the
+    field `out_of_reach` of the result says so.
 
     Parameters
     ----------
@@ -762,9 +763,9 @@ def curve_of(
 
     `groups` has each policy (settings of the rule that decides) with its replays (runs over
     recorded parts), all of the same two or more shuffles (random orders of the recordings) in the
-    same order. The choice is the cheapest policy, or one that accepts fewer bad parts and is not
-    significantly dearer; but it is "check everything" if that policy is not cheaper than a check of
-    every part (`_choose` has the exact rule). It is made again with each price halved and doubled;
+    same order. The choice is the cheapest policy, or a safer one that is not significantly dearer;
+    but it is "check everything" if no such policy is cheaper than a check of every part (`_choose`
+    has the exact rule). It is made again with each price halved and doubled;
     choices that differ are in the field `price_changes` of the result. Three arguments become
     fields of the result: `left_behind`, the policies that were dearer in earlier shuffles;
     `out_of_reach`, policies that were not played, each with the reason; and `fresh`, whether no

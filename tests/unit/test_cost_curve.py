@@ -31,6 +31,7 @@ from tests.support.replays import replay_of
 
 COSTS = Costs(check=5, escape=100, false_reject=20)
 STRICT, LAX = Policy(0.05, 0.95), Policy(0.5, 0.8)
+BY_COST = Policy(prices=(5, 100, 20))
 RECIPE = Recipe.load("pca").with_policy(stops="all")
 PRICES = {"check": 5, "escape": 20, "false_reject": 11}
 
@@ -52,14 +53,16 @@ def four(policy: Policy, *counts: int) -> dict[Policy, list[Replay]]:
 
 
 def curve(
-    lax: Sequence[tuple[int, int]], strict: Sequence[tuple[int, int]] = ((100, 0),) * 4
+    lax: Sequence[tuple[int, int]],
+    strict: Sequence[tuple[int, int]] = ((100, 0),) * 4,
+    first: Policy = LAX,
 ) -> CostCurve:
     """Of two policies; for each shuffle of 100 parts, how many were verified, and how many of the
     others were bad.
     """
     groups = {
         policy: [played(policy, seed, n, 100 - n, bad) for seed, (n, bad) in enumerate(item)]
-        for policy, item in ((LAX, lax), (STRICT, strict))
+        for policy, item in ((first, lax), (STRICT, strict))
     }
     return curve_of(groups, COSTS)
 
@@ -84,6 +87,14 @@ def test_no_row_is_cheaper_than_the_marked_one_unless_a_sentence_says_that_this_
     assert close.rows[0].cost < close.marked.cost
     assert close.policy == STRICT
     assert "Alpha 0.5, LB 80 % costs 2, which is not cheaper beyond chance" in close.sentence
+
+
+def test_the_guarantee_by_cost_is_chosen_unless_a_policy_is_cheaper_beyond_chance_or_it_is_dear():
+    close, dearer, dear = (
+        curve([(n, 1), (n, 0), (n, 1), (n, 0)], [(strict, 0)] * 4, BY_COST)
+        for n, strict in ((44, 50), (90, 50), (95, 100))
+    )
+    assert (close.policy, dearer.policy, dear.policy) == (BY_COST, STRICT, None)
 
 
 def test_the_interval_moves_the_errors_to_their_ends_and_adds_the_luck_of_the_order():
@@ -268,6 +279,7 @@ def test_the_curve_is_that_of_replays_under_the_recipes_other_settings(make_data
     assert (result.cycles, result.shuffles) == (90, 2)
     kinds = {row.policy.guarantee for row in (*result.rows, *result.left_behind)}
     assert kinds == {"local", "pooled", "cost"}
+    assert "cost" in {row.policy.guarantee for row in result.rows}
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ from typing import Any
 
 from ...errors import DataError, instead, listed, shortened
 from ..dataset import Fault, Faults
-from ..description import FOLDER_FILE, Description, Strings
+from ..description import Description, Strings
 from ..table import UnreadableError
 
 # The format of files with each suffix; `.gz` may stand behind it.
@@ -168,21 +168,22 @@ def find_files(root: Path, description: Description) -> list[str]:
     """Return the files that a description names, as paths relative to the folder.
 
     The description says how recordings are read; its `files` and `exclude` are patterns like
-    `*.csv`. The result is sorted by file name, run_2 before run_10. The file `recordings.toml`,
-    files that list labels or parts, if the description names them, and files that match a pattern
-    in `exclude` are left out. If `root` is a file, its name alone is returned, whatever the
-    description says. Raises DataError if no file is left, or for a malformed pattern.
+    `*.csv`. The result is sorted by file name, run_2 before run_10. Hidden files and others that
+    are no recordings (`names_in`), files that list labels or parts, if the description names them,
+    and files that match a pattern in `exclude` are left out. If `root` is a file, its name alone is
+    returned, whatever the description says. Raises DataError if no file is left, or for a malformed
+    pattern.
     """
     if root.is_file():
         return [root.name]
-    aside = {FOLDER_FILE, *description.listings}
-    names = match_files(root, description.files) - match_files(root, description.exclude) - aside
+    aside = match_files(root, description.exclude) | description.listings
+    names = [name for name in names_in(root, description.files) if name not in aside]
     if not names:
         raise DataError(
             f"Expected files {', '.join(description.files)} in {root}, found none; is it the "
             f"description of another folder? See `dengine data {root}`."
         )
-    return sorted(names, key=file_key)
+    return names
 
 
 def unread_note(source: Any, description: Description) -> str:

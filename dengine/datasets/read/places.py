@@ -159,13 +159,14 @@ def in_listing(name: str) -> Iterator[None]:
 class LabelReader:
     """Finds the label of a recording in one source.
 
-    source : where the label stands. listing : the different words by key (`as_key`), empty if the
-    source is no listing. files : its keys by the file name in them, as `folders_of` writes it.
-    used : the keys that were found, each with the path of the first recording that has it.
+    source : where the label stands. listing : by key (`as_key`) the different words, each with the
+    line of its first row, 0 if unknown; empty if the source is no listing. files : its keys by the
+    file name in them, as `folders_of` writes it. used : the keys that were found, each with the
+    path of the first recording that has it.
     """
 
     source: LabelSource
-    listing: Mapping[str, set[str]]
+    listing: Mapping[str, Mapping[str, int]]
     files: Mapping[str, list[str]]
     used: dict[str, str] = field(default_factory=dict)
 
@@ -196,9 +197,9 @@ class LabelReader:
             )
         words = sorted(self.listing[key])
         if len(words) > 1:
+            places = ", ".join(f"{word} in line {self.listing[key][word]}" for word in words)
             raise UnreadableError(
-                f"Expected one label for {part or path}, got {listed(words)}",
-                column=source.column,
+                f"Expected one label for {part or path} in {source.listing}, got {places}"
             )
         return words[0]
 
@@ -240,11 +241,12 @@ class LabelReader:
         source = self.source
         word = self.word(table, part)
         if word not in source.meanings:
-            raise UnreadableError(
-                f"Expected a label among {listed(source.meanings)}, got {shortened(word)}",
-                0 if source.listing or source.path else table.line(0),
-                source.column,
-            )
+            message = f"Expected a label among {listed(source.meanings)}, got {shortened(word)}"
+            if source.listing:
+                line = self.listing[self.key_of(table.path, part)][word]
+                raise UnreadableError(f"{message} in {source.listing}, line {line}")
+            line = 0 if source.path or source.line else table.line(-(source.at == "last"))
+            raise UnreadableError(message, line, source.column)
         return source.meanings[word]
 
     def unused_note(self) -> str:
@@ -295,15 +297,15 @@ def read_labels(source: LabelSource, read_listing: ListingReader) -> LabelReader
     recording or part and have the label, are not both stated and there, and LookupError for an
     encoding that Python does not know.
     """
-    listing = defaultdict[str, set[str]](set)
+    listing = defaultdict[str, dict[str, int]](dict)
     if source.listing:
         columns = (source.key, source.column)
         if not all(columns):
             raise DataError("Expected label.key and label.column, two columns of label.listing.")
         with in_listing(source.listing):
             table = read_listing(source.listing)
-            for key, word in zip(*map(table.words, columns), strict=True):
-                listing[as_key(key)].add(word)
+            for row, (key, word) in enumerate(zip(*map(table.words, columns), strict=True)):
+                listing[as_key(key)].setdefault(word, table.line(row))
     files = defaultdict[str, list[str]](list)
     for key in listing:
         files[folders_of(key)[0]].append(key)

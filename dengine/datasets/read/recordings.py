@@ -113,7 +113,7 @@ def rank_of(table: Table, seconds: Floats | None, description: Description) -> A
 
     `table` has the samples of a part, and `seconds`, shape (n,), their times; None without a clock.
     Raises UnreadableError if `order` is a column that is missing, has lists or no rows, or whose
-    first word has a date that cannot be sorted (`is_unsorted`).
+    first word is empty or has a date that cannot be sorted (`is_unsorted`).
     """
     order = description.order
     if order == "path":
@@ -121,7 +121,9 @@ def rank_of(table: Table, seconds: Floats | None, description: Description) -> A
     if order not in ORDERS:
         word = table.one_word(order, "first")
         table.refuse(
-            np.array([is_unsorted(word)]), "dates to sort by, with the year in front", order
+            np.array([not word or is_unsorted(word)]),
+            "a word to sort by, dates with the year in front",
+            order,
         )
         return sort_key(word)
     return "" if order == "name" or seconds is None else seconds[0]
@@ -227,7 +229,8 @@ def read_recordings(
     DataError
         If the description does not pass `check_description`, no file is found or a pattern in
         `files` is malformed, a bag or a listing of labels cannot be read, no recording is left, or
-        `make_dataset` refuses the traces, like those with more channels than samples.
+        `make_dataset` refuses the traces, like those with more channels than samples. If a trigger
+        begins the parts, also if a listing of labels has more or fewer rows than there are parts.
     SettingError
         If `windows.trigger`, the condition at which long recordings are cut, is malformed.
     ValueError
@@ -248,6 +251,15 @@ def read_recordings(
                     parts.append(recording_of(part, description, labels))
         if progress is not None:
             progress(1)
+    n_starts = len(parts) + len(faults)
+    for label in labels:  # in which a part that the trigger begins is found by its running number
+        by_number = description.windows.trigger and not description.part.column
+        if by_number and label.listing and len(label.listing) != n_starts:
+            raise DataError(
+                f"Expected a row of {label.source.listing} for each start of the trigger, of which "
+                f"there are {n_starts}, got {len(label.listing)}: else later parts have the labels "
+                "of others."
+            )
     n_unlabelled = parts.count(None)
     labelled = sorted(filter(None, parts), key=lambda recording: recording.rank)
     recordings, repeats = without_repeats(labelled)
@@ -304,15 +316,20 @@ def parts_of(file: str | Table, description: Description, base: Path) -> Iterato
     left out if a column that the section `[rows]` names has a single cell in it, with a word to
     drop (`is_dropped`). `base` is the folder of the file, and of the listing in `[windows]`, a file
     with the parts' starts and ends. Raises UnreadableError or DataError if the file cannot be read,
-    DataError if it cannot be split, or one of its recordings cannot be cut (those before it are
-    yielded), SettingError if `windows.trigger`, the condition at which a part begins, is malformed,
-    and LookupError for an encoding that Python does not know.
+    UnreadableError if there is no part in it, DataError if it cannot be split, or one of its
+    recordings cannot be cut (those before it are yielded), SettingError if `windows.trigger`, the
+    condition at which a part begins, is malformed, and LookupError for an encoding that Python does
+    not know.
     """
     if not isinstance(file, Table):
         file = table_of(read_file(base / file), file, description)
+    part = None
     for part in split(file, description):
         if not is_dropped(part, description.rows):
             yield from cut(part, description, base) if description.is_cut else [part]
+    if part is None:
+        columns = listed(file.columns)
+        raise UnreadableError(f"Expected parts, found none in the columns {columns}", file.header)
 
 
 def is_dropped(part: Table, rows: RowMeanings) -> bool:
