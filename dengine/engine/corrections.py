@@ -71,12 +71,9 @@ class Corrections:
     """
 
     def __init__(self, learner: Learner) -> None:
-        self._settings = learner.live.settings
         self._learner = learner
         self._live = learner.live
-        self._feedback = learner.feedback
-        self._outbox = learner.live.outbox
-        self._store = self._outbox.store
+        self._store = learner.live.outbox.store
 
     def correct(self, decision_id: str, success: bool, author: str = "") -> Changed:
         """Correct a wrong label, or let a forgotten one count again, from the next decision on.
@@ -395,7 +392,7 @@ class Corrections:
             policy,
             "for example Policy(alpha=0.05, lower_bound=0.95)",
         )
-        present = self._settings.now
+        present = self._live.settings.now
         check_rate(policy.force_limits, present.trace)
         old_policy = present.recipe.policy
         old_values = old_policy.to_values()
@@ -432,8 +429,8 @@ class Corrections:
             settings=settings.to_store(),
         )
         self._learner.set_policy(policy if starts_anew else None, evidence, event)
-        self._settings.change(settings)
-        self._feedback.begin_policy()
+        self._live.settings.change(settings)
+        self._learner.feedback.begin_policy()
         return self._finish_change(
             event, reason_ended="the rule of the new policy has no safe mode"
         )
@@ -479,7 +476,7 @@ class Corrections:
         """
         number = self._store.corrections.apply(change)
         for id_ in change.decisions:
-            self._outbox.evict_decision(id_)
+            self._live.outbox.evict_decision(id_)
         self._learner.apply_corrections()  # which may add an event: a model is trained anew
         return self._finish_change(change, number)
 
@@ -500,7 +497,7 @@ class Corrections:
         """
         if number is None:
             number = self._store.events.newest(1)[0].number
-        self._feedback.announce_safe_mode(reason_ended)
+        self._learner.feedback.announce_safe_mode(reason_ended)
         return Changed(change.kind, capitalized(f"{change.text}."), number, self._live.version)
 
     def _as_unchanged(self, kind: str, text: str) -> Changed:

@@ -63,7 +63,6 @@ class Feedback:
     def __init__(self, live: LiveModel, on_safe_mode: SafeModeListener) -> None:
         self._outbox = live.outbox
         self._live = live
-        self._window = live.window
         self._settings = live.settings
         self._on_safe_mode = on_safe_mode
         self.new_labels = 0
@@ -247,7 +246,7 @@ class Feedback:
             return
         self.new_labels += 1
         if number > 0:
-            self._window.add(stored.trace, int(success), stored.content_hash, number)
+            self._live.window.add(stored.trace, int(success), stored.content_hash, number)
         else:
             self._provisional[decision.id] = number
 
@@ -291,7 +290,7 @@ class Feedback:
 
         `after` is the sequence number of a label; labels with a larger number count.
         """
-        self.new_labels = self._window.count_newer(after)
+        self.new_labels = self._live.window.count_newer(after)
 
     def give_labels_back(self, n_labels: int) -> None:
         """Count the labels of a dropped retrain as new again, so that the next one comes soon."""

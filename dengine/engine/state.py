@@ -17,7 +17,6 @@ class EngineState:
     def __init__(self, learner: Learner) -> None:
         self._live = learner.live
         self._learner = learner
-        self._outbox = learner.live.outbox
 
     @property
     def new_labels(self) -> int:
@@ -45,7 +44,7 @@ class EngineState:
     @property
     def integrity_error(self) -> str:
         """What was changed in the store, so that every part is verified; "" if nothing was."""
-        return self._outbox.integrity_error
+        return self._live.outbox.integrity_error
 
     @property
     def store_fault(self) -> str:
@@ -53,12 +52,12 @@ class EngineState:
 
         That is the `integrity_error` if there is one, else why they cannot be written.
         """
-        return self._outbox.fault
+        return self._live.outbox.fault
 
     @property
     def store_lag(self) -> float:
         """Age in seconds of the oldest journal record that is not in the store; 0.0 if none."""
-        return self._outbox.lag
+        return self._live.outbox.lag
 
     def complete(self, status: Status) -> Status:
         """Return a copy of a status from the store, completed by what only the engine knows.
