@@ -228,7 +228,14 @@ class Feedback:
         n_unreported = None  # the rule is not updated
         if not stored.quarantined:  # an unusable trace teaches nothing
             if source is not Source.INSPECTION:
-                n_unreported = self._n_unreported - self._was_unreported(stored)
+                # The part was counted itself if the next trace came before its outcome.
+                was_counted = (
+                    decision.action is Action.ACCEPT
+                    and not self._stops_all
+                    and decision.model_version >= self._settings.now.policy_since
+                    and decision.id not in self._unreported
+                )
+                n_unreported = self._n_unreported - was_counted
                 self._n_unreported = 0
             point = self._live.learn(stored, success, number, n_unreported)
         label = NewLabel(
@@ -249,21 +256,6 @@ class Feedback:
             self._live.window.add(stored.trace, int(success), stored.content_hash, number)
         else:
             self._provisional[decision.id] = number
-
-    def _was_unreported(self, stored: StoredDecision) -> bool:
-        """Return whether this part was counted as unreported: accepted, and nobody reported it.
-
-        It was, if a model version accepted it under the present policy (the settings of the
-        decisions), which has stops="some" (not every bad accepted part is reported), and the next
-        trace came before its outcome.
-        """
-        decision = stored.decision
-        return (
-            decision.action is Action.ACCEPT
-            and not self._stops_all
-            and decision.model_version >= self._settings.now.policy_since
-            and decision.id not in self._unreported
-        )
 
     def number_labels(self) -> None:
         """In a product, give this cell's references the numbers that the store gave their labels.

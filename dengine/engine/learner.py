@@ -465,7 +465,10 @@ class Learner:
         candidate.check()
         yield None
         yield from self._catch_up_candidate(candidate)
-        storing = self._begin_storing(candidate)
+        report = candidate.complete_report(self.live.next_version)
+        model = candidate.model
+        state = None if model is None else self.live.get_state(model, candidate.trained_on)
+        storing = self._outbox.store_version(report, self._window.newest_seq, state)
         deadline = time.monotonic() + self._outbox.limit  # to begin; a commit that runs may go on
         while not storing.done() and (storing.running() or time.monotonic() < deadline):
             yield partial(self._outbox.wait_for_result, storing)
@@ -496,20 +499,6 @@ class Learner:
             else:
                 with suppress(StoreError):  # then the next time is a step again
                     self._outbox.drain()
-
-    def _begin_storing(self, candidate: Candidate) -> Future[int]:
-        """Complete the candidate's report; hand report and model to the thread that stores them.
-
-        The candidate is a trained version that is not in force yet. Returns a future of the
-        version's number: the report's, or a higher one if another cell of the product (robot cells
-        that share labels and versions) stored a version first. Without a model only the report is
-        stored, and the number is the report's. Raises StoreError if the store is unavailable. With
-        a store in memory the future is done.
-        """
-        report = candidate.complete_report(self.live.next_version)
-        model = candidate.model
-        state = None if model is None else self.live.get_state(model, candidate.trained_on)
-        return self._outbox.store_version(report, self._window.newest_seq, state)
 
     def _swap(self, candidate: Candidate) -> None:
         """Put a stored candidate (trained version) in force; keep its report for `take_report`.
