@@ -665,7 +665,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
             if stored.quarantined:
                 return None
             # Last, since it may take its budget.
-            return self._learner.retrain_if_due(self._settings.now.recipe.retrain_every)
+            return self._learner.retrain_if_due()
 
     def run(self, cell: Cell, cycles: int) -> Iterator[Cycle]:
         """Drive a robot cell, and yield a record of each cycle as it happens.
@@ -863,7 +863,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         self._outbox.check_usable()
         with self._exclusive:
             self._learner.advance(to_the_end=not brief)
-            self._learner.retrain_if_due(self.recipe.retrain_every, once=True)
+            self._learner.retrain_if_due(once=True)
             self._feedback.announce_safe_mode()
             return self._learner.take_report()
 

@@ -235,17 +235,18 @@ class Learner:
         # A version that is stored may still wait for labels that came since.
         return self._report or candidate.report
 
-    def retrain_if_due(self, retrain_every: int, once: bool = False) -> RetrainReport | None:
+    def retrain_if_due(self, once: bool = False) -> RetrainReport | None:
         """Retrain, or begin to, if there is a reason for it.
 
-        There are three reasons. First, `retrain_every` labels are new, and there are as many labels
-        as the model needs for a training (`min_traces`). Second, the training of the version in
-        force made some of its steps and not all, for example because the time budget ended it; this
-        is a reason only in a robot cell that shares no labels and versions with others, and not
-        after a retrain whose version was dropped (never put in force). Third, a retrain was
-        requested earlier and could not begin then, or a training was discarded and is to begin
-        again. A version that a rollback pinned is not replaced, and such a request is withdrawn.
-        What the copying of a model that the user handed in raises is raised.
+        There are three reasons. First, as many labels are new as the recipe's `retrain_every` says,
+        and there are as many labels as the model needs for a training (`min_traces`). Second, the
+        training of the version in force made some of its steps and not all, for example because the
+        time budget ended it; this is a reason only in a robot cell that shares no labels and
+        versions with others, and not after a retrain whose version was dropped (never put in
+        force). Third, a retrain was requested earlier and could not begin then, or a training was
+        discarded and is to begin again. A version that a rollback pinned is not replaced, and such
+        a request is withdrawn. What the copying of a model that the user handed in raises is
+        raised.
 
         In a product (robot cells that share labels and versions) a newer version and changes of
         labels of other cells are taken over first, so another cell's version may be in force
@@ -254,8 +255,6 @@ class Learner:
 
         Parameters
         ----------
-        retrain_every : int
-            Number of new labels after which a retrain is due.
         once : bool, default False
             If True, the second reason does not count while the report of the last retrain waits for
             `take_report`.
@@ -268,7 +267,7 @@ class Learner:
             stored, if a training or its preparation is under way, or if the executor now trains.
         """
         peers = self._peers
-        may_train = self._has_labels(retrain_every) and not (self.live.pinned or self.is_at_work)
+        may_train = self._has_labels and not (self.live.pinned or self.is_at_work)
         if peers is not None and (may_train or peers.is_look_due):
             self._try_to_hear(peers, with_labels=False)
         if self.live.pinned:
@@ -278,7 +277,7 @@ class Learner:
         # without new labels. Peers would each train the same version, so they wait for labels.
         is_alone = peers is None and self._was_accepted
         lacks_steps = is_alone and self.live.lacks_steps and not (once and self._report is not None)
-        if not (self._has_labels(retrain_every) or lacks_steps or self._is_requested):
+        if not (self._has_labels or lacks_steps or self._is_requested):
             return None
         if self._outbox.fault:
             return None
@@ -287,12 +286,13 @@ class Learner:
         except StoreError:  # logged by the outbox; the labels wait in its journal
             return None
 
-    def _has_labels(self, retrain_every: int) -> bool:
-        """Return whether `retrain_every` labels are new, and the new ones, or those in the training
-        window, are as many as a training needs (`min_traces`).
+    @property
+    def _has_labels(self) -> bool:
+        """Whether as many labels are new as the recipe's `retrain_every` says, and the new ones, or
+        those in the training window, are as many as a training needs (`min_traces`).
         """
         n_new = self.feedback.new_labels
-        return n_new >= retrain_every and (
+        return n_new >= self.live.settings.now.recipe.retrain_every and (
             max(n_new, len(self._window)) >= self.live.newest.min_traces
         )
 
