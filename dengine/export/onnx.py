@@ -32,7 +32,7 @@ from ..decision.rule import DecisionRule
 from ..errors import ExportError, instead
 from ..files import FilePath
 from ..model.base import Exportable
-from ..model.neighbours import NOVEL
+from ..model.neighbours import NOVEL, is_close
 from ..records import ACTIONS, REASONS, TraceSpec
 from ..traces import CONSTANT, LARGEST, NOT_FINITE, SATURATED, TOO_LARGE, as_trace
 from .bundle import (
@@ -395,7 +395,7 @@ def _check_decisions(onnx_model: OnnxModel, model: Any, spec: TraceSpec) -> None
     if spec.limit is not None:
         X = np.clip(X, -0.9 * spec.limit, 0.9 * spec.limit)
     for actual, expected in zip(map(onnx_model.decide, X), model.predict_many(X), strict=True):
-        is_near = np.allclose(actual.embedding, expected.embedding, rtol=TOLERANCE, atol=TOLERANCE)
+        is_near = is_close(actual.embedding, expected.embedding, TOLERANCE)
         differences = np.abs(np.subtract(NUMBERS(actual), NUMBERS(expected)))
         n_moved = differences[2:].sum()
         is_same = actual.action == expected.action and differences.sum() <= BOUND_TOLERANCE

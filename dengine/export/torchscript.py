@@ -33,6 +33,7 @@ from ..engine.decide import as_part
 from ..errors import ExportError, instead
 from ..files import FilePath, new_folder
 from ..folds import part_hash
+from ..model.neighbours import is_close
 from ..records import (
     ACTIONS,
     REASONS,
@@ -408,9 +409,7 @@ def _check_golden(model: ExportedModel, path: Path) -> None:
         embedding = model.decide(trace).embedding
         model.learn(trace, True)
         model.stop(trace)
-    if embedding.shape != expected.shape or not np.allclose(
-        embedding, expected, atol=TOLERANCE, rtol=TOLERANCE
-    ):
+    if embedding.shape != expected.shape or not is_close(embedding, expected, TOLERANCE):
         raise ExportError(
             f"{path} loads, but this machine does not reproduce its golden embedding; export it "
             "anew here."
