@@ -234,7 +234,7 @@ def _look_like_float64(words: NDArray[np.float32]) -> bool:
 
 
 def _response_type(
-    name: str, about: str, record: type | None = None, without: tuple[str, ...] = (), **more: Any
+    name: str, about: str, /, record: type | None = None, without: tuple[str, ...] = (), **more: Any
 ) -> type[Struct]:
     """Make and return a msgspec struct type named `name`, which describes a response.
 
@@ -289,26 +289,6 @@ def _described(hint: Any, text: str) -> Any:
     return Annotated[hint, Meta(description=text)]
 
 
-class Health(Struct):
-    """Whether the engine answers, and what is wrong with it: the response of /healthz."""
-
-    status: Literal["ok", "degraded", "down"]
-    store_fault: Annotated[str, Meta(description="Why the store cannot be written, or empty.")]
-    retrain_fault: Annotated[
-        str, Meta(description="Why retrains are dropped again and again, or empty.")
-    ]
-    waiting: Annotated[int, Meta(description="Requests in the queue.")]
-
-
-class Me(Struct):
-    """The owner of the token that a request has."""
-
-    name: Annotated[
-        str, Meta(description="For the event log; empty: the author that a request names.")
-    ]
-    operates: Annotated[bool, Meta(description="May report and change; else only read.")]
-
-
 class Problem(Struct):
     """Why a request is not served, in the form of RFC 9457. A part without a decision is
     verified.
@@ -346,7 +326,7 @@ RESPONSES = {
             seconds=_described(float, "From the request to the response, in the server."),
         ),
         _response_type("ReportResponse", "The label is on disk.", ReportResponse),
-        _response_type("Changed", "", Changed),
+        _json_type(Changed),
         DecisionResponse,
         _response_type(
             "Decisions",
@@ -378,12 +358,24 @@ RESPONSES = {
             alarm=_described(str, "What somebody should look at, or empty."),
             claim=_described(str, "What the certificate says of accepted parts, as a sentence."),
         ),
-        _response_type("Course", "", Course),
-        _response_type("PartMap", "", PartMap),
+        _json_type(Course),
+        _json_type(PartMap),
         _response_type("Events", "Newest first.", events=_json_type(list[Event])),
         _response_type("Versions", "Oldest first.", versions=_json_type(list[StoredVersion])),
-        Health,
-        Me,
+        _response_type(
+            "Health",
+            "Whether the engine answers, and what is wrong with it: the response of /healthz.",
+            status=Literal["ok", "degraded", "down"],
+            store_fault=_described(str, "Why the store cannot be written, or empty."),
+            retrain_fault=_described(str, "Why retrains are dropped again and again, or empty."),
+            waiting=LINE["waiting"],
+        ),
+        _response_type(
+            "Me",
+            "The owner of the token that a request has.",
+            name=_described(str, "For the event log; empty: the author that a request names."),
+            operates=_described(bool, "May report and change; else only read."),
+        ),
         Problem,
     )
 }

@@ -13,7 +13,7 @@ from dataclasses import replace
 from functools import cached_property
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 from msgspec import Meta
@@ -278,7 +278,7 @@ class HttpApi:
         name), or an author that is not the token's; 503: the queue is full, or the store does not
         answer.
         """
-        return await self._change(author, lambda engine, by: engine.release(by))
+        return await self._change(author, DataEngine.release)
 
     async def policy(self, author: Author = "", **changes: Any) -> Changed:
         """Change settings of the policy, from the next decision on; shadow verifies every part.
@@ -489,11 +489,11 @@ class HttpApi:
         """
         running = self.service.engine.state
         is_alive = self.service.silent_seconds < MAX_SILENT
-        faults = (running.store_fault, running.retrain_fault)
-        state: Literal["ok", "degraded", "down"] = "degraded" if any(faults) else "ok"
+        faults = {"store_fault": running.store_fault, "retrain_fault": running.retrain_fault}
+        state = "degraded" if any(faults.values()) else "ok"
         if not is_alive:
             state = "down"
-        health = api.Health(state, *faults, self.service.waiting)
+        health = response_fields("Health", status=state, waiting=self.service.waiting, **faults)
         return api.json_response(health, 200 if is_alive else 503)
 
     async def openapi(self) -> Json:

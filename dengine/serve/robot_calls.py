@@ -219,7 +219,7 @@ class RobotCalls:
         """
         if (stored := await self._find(request)) is not None:
             return stored
-        pieces = self._pieces.get(as_id(request))
+        pieces = self._pieces.get(request)
         if not pieces:
             raise TraceError(
                 "Expected begin and add before decide_added, got no pieces of "
