@@ -392,7 +392,8 @@ class Corrections:
             policy,
             "for example Policy(alpha=0.05, lower_bound=0.95)",
         )
-        present = self._live.settings.now
+        live = self._live
+        present = live.settings.now
         check_rate(policy.force_limits, present.trace)
         old_policy = present.recipe.policy
         old_values = old_policy.to_values()
@@ -409,7 +410,6 @@ class Corrections:
             # Audits count by the inclusion probability, so pooled evidence must be of one rate.
             or policy.rule().extra_arguments != old_policy.rule().extra_arguments
         )
-        live = self._live
         since = live.next_version
         evidence = present.evidence
         if starts_anew:
@@ -429,7 +429,7 @@ class Corrections:
             settings=settings.to_store(),
         )
         self._learner.set_policy(policy if starts_anew else None, evidence, event)
-        self._live.settings.change(settings)
+        live.settings.change(settings)
         self._learner.feedback.begin_policy()
         return self._finish_change(
             event, reason_ended="the rule of the new policy has no safe mode"

@@ -636,19 +636,20 @@ class Learner:
         if the store is unavailable, and what `retrain` raises, or, for a pinned model that is
         fitted again, `roll_back`.
         """
+        live = self.live
         self._outbox.check_integrity(0)  # the rule is rebuilt from all of it
-        corrections = self._store.corrections.after(self.live.corrected_to)
-        corrected_to = corrections[-1].number if corrections else self.live.corrected_to
+        corrections = self._store.corrections.after(live.corrected_to)
+        corrected_to = corrections[-1].number if corrections else live.corrected_to
         self._refill_window(corrected_to)
-        self.live.rebuild_rule()
+        live.rebuild_rule()
         # After the rule, whose outcomes the store may not give: a later call does not apply these
         # corrections again, so it would not know that the model must be retrained.
-        is_done = self.live.apply_corrections(corrections)
+        is_done = live.apply_corrections(corrections)
         self._precompute_other_start()
         if is_done or not may_retrain:
             return
-        if self.live.pinned:
-            version = self.live.version
+        if live.pinned:
+            version = live.version
             self.roll_back(
                 version,
                 Change(

@@ -568,9 +568,10 @@ def replay(
     """
     data = load_dataset(dataset)
     changes = without_none({"alpha": alpha, "lower_bound": lower_bound})
-    n_cycles = len(data) if cycles is None else cycles
-    expect(1 <= n_cycles <= len(data), f"1 to {len(data)} cycles from {data.name}", n_cycles)
-    order = np.random.default_rng(seed).permutation(len(data)) if shuffle else np.arange(len(data))
+    n_parts = len(data)
+    n_cycles = n_parts if cycles is None else cycles
+    expect(1 <= n_cycles <= n_parts, f"1 to {n_parts} cycles from {data.name}", n_cycles)
+    order = np.random.default_rng(seed).permutation(n_parts) if shuffle else np.arange(n_parts)
     order = order[:n_cycles]
     if not isinstance(recipe, DataEngine):
         contender = Contender.load(recipe).with_policy(**changes)

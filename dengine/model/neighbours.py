@@ -478,11 +478,12 @@ class ModelPrediction(EngineModel):
         """
         X = clip_extremes(X)
         y = y.astype(np.int64)
-        is_one_part = len(X) >= MANY_OF_ONE and (hashes == hashes[0]).all()
+        n = len(X)
+        is_one_part = n >= MANY_OF_ONE and (hashes == hashes[0]).all()
         expect(
             not is_one_part,
             "traces of several parts",
-            f"{len(X)} of one: all have its number, or are the same to 1/65536 of their unit",
+            f"{n} of one: all have its number, or are the same to 1/65536 of their unit",
             "check part=, the sensor and the unit",
         )
         folds = fold_of(hashes, self.n_spaces)
@@ -495,7 +496,7 @@ class ModelPrediction(EngineModel):
         self.index = RadiusIndex(points.shape[1], self.classifier.capacity)
         self.index.add(points / self.scale[folds, None], y, folds, hashes, numbers)
         self.index.estimate_agreement()
-        self.examples = X[np.linspace(0, len(X) - 1, min(len(X), N_EXAMPLES)).astype(int)]
+        self.examples = X[np.linspace(0, n - 1, min(n, N_EXAMPLES)).astype(int)]
         self._note = repeats_note(X, hashes)
         if self.novelty:
             self.gate = fit_novelty(X, self.novelty, hashes)
