@@ -233,7 +233,7 @@ def _as_key(value: object) -> object:
     if isinstance(value, CONSTANTS):
         return repr(value)
     if isinstance(value, Tensor):
-        return tuple(value.shape)
+        return value.shape
     if not isinstance(value, list | tuple | dict):
         return None
     items = value.items() if isinstance(value, dict) else enumerate(value)
@@ -711,7 +711,7 @@ class ModelPrediction(EngineModel):
         """
         was_stale = self.rule_is_stale
         self.rule_is_stale = True
-        before = dict(self.rule.state_dict())
+        before = self.rule.state_dict()
         self.rule.observe(n_unreported, novel)
         self.rule.update(lower, upper, success, predicted, inclusion_probability)
         for name, value in self.rule.state_dict().items():
