@@ -88,8 +88,21 @@ def pooled_error(replays: Sequence[Any], side: str = "accepted", alpha: float = 
     """
     expect(side in SIDES, f"side {' or '.join(SIDES)}", side)
     size = 1 + max((int(replay.index.max()) for replay in replays if len(replay.index)), default=0)
-    decided = _count_per_trace(replays, side, size)
-    wrong = _count_per_trace(replays, SIDES[side], size)
+
+    def count_per_trace(name: str) -> Floats:
+        """Return for each trace of the data set in how many cycles of all replays a field was True.
+
+        The result is float64, shape (size,), by the index of the trace in the data set. `name` is a
+        field of `Replay` with a bool for each cycle; its field `index` says which trace a cycle
+        had.
+        """
+        counts = np.zeros(size)
+        for replay in replays:
+            counts += np.bincount(replay.index[getattr(replay, name)], minlength=size)
+        return counts
+
+    decided = count_per_trace(side)
+    wrong = count_per_trace(SIDES[side])
     n_decided = int(decided.sum())
     n_wrong = int(wrong.sum())
     n_traces = int((decided > 0).sum())
@@ -100,7 +113,7 @@ def pooled_error(replays: Sequence[Any], side: str = "accepted", alpha: float = 
     correction = n_traces / max(n_traces - 1, 1)
     variance = correction * float((residuals**2).sum()) / n_decided**2
     n_effective = float(n_traces)
-    if variance > 0.0 and 0.0 < rate < 1.0:
+    if variance > 0.0:  # so the rate is neither 0 nor 1
         n_effective = rate * (1.0 - rate) / variance
     lower, upper = wilson_interval(n_effective * rate, n_effective * (1.0 - rate), alpha)
     return ErrorRate(n_decided, n_wrong, n_traces, rate, lower, upper)
@@ -109,18 +122,6 @@ def pooled_error(replays: Sequence[Any], side: str = "accepted", alpha: float = 
 def share_right(n_wrong: int, n_decided: int) -> float:
     """Return the share of right decisions, from 0 to 1; NaN if nothing was decided."""
     return 1.0 - n_wrong / n_decided if n_decided else math.nan
-
-
-def _count_per_trace(replays: Sequence[Any], name: str, size: int) -> Floats:
-    """Return for each trace of a data set in how many cycles of all replays a field was True.
-
-    The result is float64, shape (size,), by the index of the trace in the data set. `name` is a
-    field of `Replay` with a bool for each cycle; its field `index` says which trace a cycle had.
-    """
-    counts = np.zeros(size)
-    for replay in replays:
-        counts += np.bincount(replay.index[getattr(replay, name)], minlength=size)
-    return counts
 
 
 @dataclass(frozen=True, slots=True)
