@@ -331,8 +331,8 @@ def iterate_replays(
             if kept is not None:
                 finished[i] = PlayedReplay(i, kept, True)
     yield from finished.values()
-    missing = [i for i in range(len(tasks)) if i not in finished]
-    missing.sort(key=lambda i: tasks[i].seed)
+    all_by_seed = sorted(range(len(tasks)), key=lambda i: tasks[i].seed)
+    missing = [i for i in all_by_seed if i not in finished]
     for name in sorted({tasks[i].contender.baseline or "" for i in missing} - {""}):
         baseline_class(name)
     for played in Parallel(n_jobs=n_jobs, return_as="generator_unordered")(
