@@ -197,17 +197,17 @@ def embedding_map(replay: Replay, title: str = "") -> Figure:
     left.set(ylabel=y_label)
     if is_probability:
         left.set_xlim(-0.06, 1.06)
-    elif embedded.any():
-        low = z[embedded].min(axis=0)
-        high = z[embedded].max(axis=0)
-        half = 0.56 * (high - low).max() + 1e-9  # the panel is a square in data units
-        x, y = (low + high) / 2
-        left.set(xlim=(x - half, x + half), ylim=(y - half, y + half))
-    if embedded.any():
-        _draw_neighbourhood(figure, z[embedded][-1], replay.recipe.radius, is_probability)
-    if not is_probability:
+    else:
         left.set_aspect("equal")
         right.set_aspect("equal")
+        if embedded.any():
+            low = z[embedded].min(axis=0)
+            high = z[embedded].max(axis=0)
+            half = 0.56 * (high - low).max() + 1e-9  # the panel is a square in data units
+            x, y = (low + high) / 2
+            left.set(xlim=(x - half, x + half), ylim=(y - half, y + half))
+    if embedded.any():
+        _draw_neighbourhood(figure, z[embedded][-1], replay.recipe.radius, is_probability)
     return figure
 
 
@@ -347,8 +347,7 @@ def curves(by_recipe: Mapping[str, Sequence[Replay]], title: str = "") -> Figure
         for kind, decided, word, line in ERRORS:
             errors.plot(x, shares[kind], line, color=colour)
             n_wrong, n_decided = (
-                sum(int(getattr(replay, field).sum()) for replay in replays)
-                for field in (kind, decided)
+                sum(getattr(replay, field).sum() for replay in replays) for field in (kind, decided)
             )
             wrong.append(f"{n_wrong} {word} of {n_decided} {decided}")
         handles += certain.plot([], color=colour, label=f"{name}: {', '.join(wrong)}")
