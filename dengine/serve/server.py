@@ -194,26 +194,27 @@ def serve(
         listening_socket(host, port) as listening,
         RetrainingProcess() as executor,
         recorder() as opened_recorder,
+        closing(
+            CellService(lambda: make(executor), store, deadline, check_seconds=check_seconds)
+        ) as service,
     ):
-        service = CellService(lambda: make(executor), store, deadline, check_seconds=check_seconds)
-        with closing(service):
-            app = create_app(service, tokens, recorder=opened_recorder)
-            scheme = "http" if cert is None else "https"
-            address = f"{scheme}://{host_in_url(host)}:{listening.getsockname()[1]}"
-            audience = "" if tokens else ", to this machine alone"
-            line = f"{service.engine.store.cell_id} is served at {address}{audience}."
-            config = uvicorn.Config(app, ssl_certfile=cert, ssl_keyfile=key, **UVICORN_OPTIONS)
-            server = CellServer(config, service, lambda: say(line))
+        app = create_app(service, tokens, recorder=opened_recorder)
+        scheme = "http" if cert is None else "https"
+        address = f"{scheme}://{host_in_url(host)}:{listening.getsockname()[1]}"
+        audience = "" if tokens else ", to this machine alone"
+        line = f"{service.engine.store.cell_id} is served at {address}{audience}."
+        config = uvicorn.Config(app, ssl_certfile=cert, ssl_keyfile=key, **UVICORN_OPTIONS)
+        server = CellServer(config, service, lambda: say(line))
 
-            async def run() -> None:
-                """Start what runs beside the server, serve until a signal comes, and end it."""
-                async with AsyncExitStack() as stack:
-                    for start in beside:
-                        await stack.enter_async_context(start(service))
-                    await server.serve([listening])
+        async def run() -> None:
+            """Start what runs beside the server, serve until a signal comes, and end it."""
+            async with AsyncExitStack() as stack:
+                for start in beside:
+                    await stack.enter_async_context(start(service))
+                await server.serve([listening])
 
-            with quick_switches():
-                asyncio.run(run())
+        with quick_switches():
+            asyncio.run(run())
 
 
 class CellServer(uvicorn.Server):
