@@ -194,8 +194,8 @@ class DecisionTable(CellTable):
         return (
             sa.select(
                 *DECISION.c,
-                SUCCESS.label("success"),
-                SOURCE.label("source"),
+                SUCCESS,
+                SOURCE,
                 LABEL.c.seq.label("label_seq"),
                 LABEL.c.time.label("label_time"),
             )
@@ -312,8 +312,8 @@ class DecisionTable(CellTable):
             sa.select(
                 *columns,
                 aged,
-                SUCCESS.label("success"),
-                SOURCE.label("source"),
+                SUCCESS,
+                SOURCE,
                 sa.func.count().label("n"),
                 sa.func.min(DECISION.c.time).label("first"),
                 sa.func.max(DECISION.c.time).label("last"),

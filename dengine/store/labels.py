@@ -17,11 +17,11 @@ from .decisions import DecisionTable
 from .events import EventTable
 from .ledger import is_intact
 from .queries import (
+    AUDIT_COLUMNS,
     LABEL_OF_DECISION,
     TRACE_OF_LABEL,
     TRAINS,
     Scope,
-    audit_columns,
     corrected_label,
 )
 from .records import (
@@ -206,7 +206,7 @@ class LabelTable(CellTable):
             For a stored value that cannot be read, and if the database fails.
         """
         query = (
-            sa.select(*LABEL.c, *DECISION.c["lower", "upper", "reason"], *audit_columns())
+            sa.select(*LABEL.c, *DECISION.c["lower", "upper", "reason"], *AUDIT_COLUMNS)
             .select_from(LABEL.join(DECISION, LABEL_OF_DECISION))
             .where(self._own(LABEL), LABEL.c.seq > int(after))
             .order_by(LABEL.c.seq)
@@ -269,7 +269,7 @@ class LabelTable(CellTable):
                 label == 1,
                 DECISION.c.reason == Reason.NOVEL.value,
                 LABEL.c.silent,
-                *audit_columns(),
+                *AUDIT_COLUMNS,
                 known_overdue,
             )
             .select_from(LABEL.join(DECISION, LABEL_OF_DECISION))

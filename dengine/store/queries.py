@@ -168,8 +168,12 @@ def join_product(connection: sa.Connection, cell_id: str, product: str | None) -
         "leave it out, or name another cell",
         StoreError,
     )
-    is_name = bool(product.strip()) and product.isprintable()
-    expect(is_name, "a product's name of printable characters", product, error=StoreError)
+    expect(
+        bool(product.strip()) and product.isprintable(),
+        "a product's name of printable characters",
+        product,
+        error=StoreError,
+    )
     has_labels = Scope(cell_id).newest(connection, LABEL.c.seq) > 0
     expect(
         not (has_labels or read_settings(connection, cell_id)),
@@ -214,35 +218,31 @@ def corrected_label(corrected_to: int | None = None) -> sa.ColumnElement[int | N
     return sa.func.coalesce(newest, sa.cast(LABEL.c.success, sa.Integer))
 
 
-def audit_columns() -> tuple[sa.ColumnElement[int], sa.ColumnElement[float]]:
-    """Return two SQL columns of a decision: `predicted` and `inclusion_probability`.
-
-    By these a decision rule tells audits (checks of parts that the model would have decided without
-    a check) from other checks. `predicted` is what the model alone would have done, as an
-    `ActionCode`: 0 verify, 1 accept, 2 reject. `inclusion_probability` is `Decision.propensity`,
-    the probability with which the part was to be verified (checked), if the action is VERIFY, else
-    0.
-    """
-    positions = {action.value: position for position, action in enumerate(ACTIONS)}
-    probability = sa.case(
-        (DECISION.c.action == Action.VERIFY.value, DECISION.c.propensity), else_=0.0
-    )
-    return (
-        sa.case(positions, value=DECISION.c.predicted).label("predicted"),
-        probability.label("inclusion_probability"),
-    )
-
+# Two columns of a decision, by which a decision rule tells audits (checks of parts that the model
+# would have decided without a check) from other checks. `predicted` is what the model alone would
+# have done, as an `ActionCode`: 0 verify, 1 accept, 2 reject. `inclusion_probability` is
+# `Decision.propensity`, the probability with which the part was to be verified (checked), if the
+# action is VERIFY, else 0.
+AUDIT_COLUMNS = (
+    sa.case(
+        {action.value: position for position, action in enumerate(ACTIONS)},
+        value=DECISION.c.predicted,
+    ).label("predicted"),
+    sa.case((DECISION.c.action == Action.VERIFY.value, DECISION.c.propensity), else_=0.0).label(
+        "inclusion_probability"
+    ),
+)
 
 # The label after corrections: 0 or 1; NULL if there is none, or it was forgotten.
-SUCCESS: sa.ColumnElement[int | None] = sa.func.nullif(corrected_label(), FORGOTTEN)
+SUCCESS: sa.Label[int | None] = sa.func.nullif(corrected_label(), FORGOTTEN).label("success")
 
 # Where a label comes from, after corrections: an accepted part that silence confirmed, and that is
 # known to be bad, is one of a stop, which came late.
-SOURCE: sa.ColumnElement[str | None] = sa.case(
+SOURCE: sa.Label[str | None] = sa.case(
     (
         (LABEL.c.source == sa.literal_column("'confirmed'"))
         & (corrected_label() == sa.literal_column("0")),
         sa.literal_column("'stop'"),
     ),
     else_=LABEL.c.source,
-)
+).label("source")
