@@ -11,21 +11,19 @@ import errno
 import os
 import threading
 import weakref
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 LOCKED_BYTE = 2**31 - 2  # the last that the C library of Windows can lock
 
 
-def _lock_of_system() -> Callable[[int], object]:
-    """Return a function that locks an open file, given by its descriptor, for this process.
+def _lock(descriptor: int) -> None:
+    """Lock an open file, given by its descriptor, for this process, without waiting.
 
-    The function does not wait: it raises BlockingIOError if another descriptor has the lock, and
-    the OSError of the system if it fails for another reason, for example because the file system
-    has no locks. The lock ends when the file is closed or the process ends. It is an exclusive lock
-    by `flock`. On Windows one byte far behind the content is locked, and the function moves the
-    offset of the file there.
+    Raise BlockingIOError if another descriptor has the lock, and the OSError of the system if it
+    fails for another reason, for example because the file system has no locks. The lock ends when
+    the file is closed or the process ends. It is an exclusive lock by `flock`. On Windows one byte
+    far behind the content is locked, and the offset of the file is moved there.
     """
     try:
         import fcntl
@@ -33,20 +31,13 @@ def _lock_of_system() -> Callable[[int], object]:
         import msvcrt
 
         windows: Any = msvcrt  # of which a type checker on another system knows nothing
-
-        def lock_byte(descriptor: int) -> None:
-            """Lock one byte of the file without waiting; BlockingIOError if it is locked."""
-            os.lseek(descriptor, LOCKED_BYTE, os.SEEK_SET)
-            try:
-                windows.locking(descriptor, windows.LK_NBLCK, 1)
-            except PermissionError as error:  # as it says that the byte is locked
-                raise BlockingIOError(errno.EAGAIN, os.strerror(errno.EAGAIN)) from error
-
-        return lock_byte
-    return lambda descriptor: fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-
-
-LOCK = _lock_of_system()
+        os.lseek(descriptor, LOCKED_BYTE, os.SEEK_SET)
+        try:
+            windows.locking(descriptor, windows.LK_NBLCK, 1)
+        except PermissionError as error:  # as it says that the byte is locked
+            raise BlockingIOError(errno.EAGAIN, os.strerror(errno.EAGAIN)) from error
+    else:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
 
 def open_plain(path: Path, flags: int) -> int:
@@ -86,11 +77,14 @@ class OwnedFile:
     def __init__(self, path: Path, owning: bool) -> None:
         self.path = path
         self._seeking = threading.Lock()
-        self._fd = self._open_and_lock() if owning else open_plain(path, os.O_RDONLY)
+        if owning:
+            self._open_and_lock()
+        else:
+            self._fd = open_plain(path, os.O_RDONLY)
         _OPEN.add(self)
 
-    def _open_and_lock(self) -> int:
-        """Create the file and its folder if need be, open and lock it; return the descriptor.
+    def _open_and_lock(self) -> None:
+        """Create the file and its folder if need be, open and lock it.
 
         If the file was deleted or replaced before it was locked, this starts again. Raise
         BlockingIOError if it is locked already, and OSError for a symbolic link and whatever else
@@ -100,9 +94,9 @@ class OwnedFile:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             self._fd = open_plain(self.path, os.O_RDWR | os.O_CREAT)
             try:
-                LOCK(self._fd)
+                _lock(self._fd)
                 if self.in_place():
-                    return self._fd
+                    return
             except BaseException:
                 os.close(self._fd)
                 raise
