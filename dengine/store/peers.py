@@ -129,36 +129,27 @@ def list_cells(url: str) -> list[CellSummary]:
     StoreError if the database is not there, is no store or cannot be read. No row is written (see
     `reading`).
     """
+    summaries = []
     with reading(url) as connection:
         settings = connection.execute(sa.select(SETTING)).all()
         products = {row.cell_id: row.value for row in settings if row.key == PRODUCT_KEY}
-        return [
-            _summarize(connection, Scope(name, products.get(name)))
-            for name in sorted({row.cell_id for row in settings})
-        ]
-
-
-def _summarize(connection: sa.Connection, cell: Scope) -> CellSummary:
-    """Return the summary of a robot cell: counts, newest model version, time of the last record.
-
-    `cell` has the cell's id and its product (robot cells that share labels and versions). The
-    numbers of decisions and labels are the cell's own. `version` is the newest version that was put
-    in force in the cell or its product, None before the first; `last_seen` the time of the newest
-    decision or label, None before the first decision.
-    """
-    (n_decisions, last_decision), (n_labels, last_label) = (
-        connection.execute(
-            sa.select(sa.func.count(), sa.func.max(table.c.time)).where(
-                table.c.cell_id == cell.cell_id
+        for name in sorted({row.cell_id for row in settings}):
+            (n_decisions, last_decision), (n_labels, last_label) = (
+                connection.execute(
+                    sa.select(sa.func.count(), sa.func.max(table.c.time)).where(
+                        table.c.cell_id == name
+                    )
+                ).one()
+                for table in (DECISION, LABEL)
             )
-        ).one()
-        for table in (DECISION, LABEL)
-    )
-    return CellSummary(
-        cell_id=cell.cell_id,
-        product=cell.product,
-        decisions=n_decisions,
-        labels=n_labels,
-        version=cell.newest_version(connection) or None,
-        last_seen=max(last_decision, last_label or 0.0) if n_decisions else None,
-    )
+            product = products.get(name)
+            summary = CellSummary(
+                cell_id=name,
+                product=product,
+                decisions=n_decisions,
+                labels=n_labels,
+                version=Scope(name, product).newest_version(connection) or None,
+                last_seen=max(last_decision, last_label or 0.0) if n_decisions else None,
+            )
+            summaries.append(summary)
+    return summaries
