@@ -277,7 +277,7 @@ def output_file(
             target.parent.mkdir(parents=True, exist_ok=True)
         partial = target.with_name(f".dengine-{secrets.token_hex(8)}.partial")
         # Exclusively, so that no link that somebody put there is followed.
-        os.close(os.open(partial, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666))
+        partial.touch(exist_ok=False)
         try:
             yield partial
             with partial.open("r+b") as file:

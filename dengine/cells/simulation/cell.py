@@ -165,8 +165,9 @@ def insert_once(
     conditions = draw_conditions(parameters, world_rng)
     pushed = push(conditions, time_step_s)
     # The faults of the sensor have a stream of their own, so that they do not reveal the outcome.
-    ranges = [getattr(parameters, field.name) for field in fields(SensorFaults)]
-    faults = SensorFaults(*(sensor_rng.uniform(*limits) for limits in ranges))
+    faults = SensorFaults(
+        *(sensor_rng.uniform(*getattr(parameters, field.name)) for field in fields(SensorFaults))
+    )
     faults = replace(faults, bias_n=faults.bias_n + parameters.bias_offset_n)
     success = abs(pushed.height_mm) <= parameters.height_tolerance_mm
     return SimulatedInsertion(
@@ -209,8 +210,7 @@ def _make_generators(seed: int, cycle: int) -> list[Generator]:
 
     They depend on seed and cycle alone.
     """
-    seeds = np.random.SeedSequence(seed, spawn_key=(cycle,)).spawn(3)
-    return list(map(np.random.default_rng, seeds))
+    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(cycle,))).spawn(3)
 
 
 class SimulatedCell:

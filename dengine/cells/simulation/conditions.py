@@ -224,8 +224,11 @@ def draw_conditions(parameters: CellParameters, rng: Generator) -> Conditions:
 
     without_fault = {"fault": "none", "extra_width_mm": 0.0, "debris_mm": 0.0}
     # The values are drawn in the order of the fields.
-    names = [field.name for field in fields(Conditions) if field.name not in without_fault]
-    values = {name: draw(_DRAWN_BY.get(name, name)) for name in names}
+    values = {
+        field.name: draw(_DRAWN_BY.get(field.name, field.name))
+        for field in fields(Conditions)
+        if field.name not in without_fault
+    }
     normal = Conditions(**without_fault, **values)  # type: ignore[arg-type]
     changes: dict[str, dict[str, float]] = {
         "weak_grip": {"grip_n": draw("weak_grip_n")},

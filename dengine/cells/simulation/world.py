@@ -102,10 +102,9 @@ def push(conditions: Conditions, time_step_s: float = TIME_STEP_S) -> Push:
     force = _drive(mujoco, model, data, conditions, steps)
     if conditions.fault == "missed_grasp":
         return Push(force, height_mm=-LENGTH_MM, slip_mm=0.0)
-    top_mm = 1000 * float(data.site("top").xpos[2])
     return Push(
         force,
-        height_mm=top_mm - (LENGTH_MM - DEPTH_MM),
+        height_mm=1000 * float(data.site("top").xpos[2]) - (LENGTH_MM - DEPTH_MM),
         slip_mm=1000 * float(data.joint("in_hand").qpos[0]),
     )
 
@@ -120,8 +119,7 @@ def _drive(mujoco: Any, model: Any, data: Any, conditions: Conditions, steps: in
     sample is less than 8 N below this limit, the push slows down; if it is above the limit, the
     gripper moves back.
     """
-    for _ in range(_SETTLE_SAMPLES):
-        mujoco.mj_step(model, data, steps)
+    mujoco.mj_step(model, data, _SETTLE_SAMPLES * steps)
     settled = float(data.sensordata[2])
     travel_m = (
         conditions.gap_mm + conditions.protrusion_mm + DEPTH_MM + conditions.overtravel_mm

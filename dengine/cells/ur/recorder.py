@@ -241,7 +241,7 @@ class RtdeRecorder(AbstractContextManager["RtdeRecorder"]):
         rows = rows if start is not None and start.seen else []
         values = np.array(
             [[row.values[c] for c in self._columns] for row in rows], dtype=np.float64
-        ).reshape(len(rows), len(self._columns))
+        ).reshape(-1, len(self._columns))
         trace, n_missing = place(
             [row.timestamp for row in rows], values, first, self.spec.samples, self._step
         )
