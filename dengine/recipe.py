@@ -176,9 +176,10 @@ class Recipe:
             self.params,
         )
         for name, value in self.params.items():
-            is_plain = isinstance(value, PLAIN) and value != "none"
             expect(
-                is_plain and BARE_KEY.fullmatch(str(name)) is not None,
+                isinstance(value, PLAIN)
+                and value != "none"
+                and BARE_KEY.fullmatch(str(name)) is not None,
                 "params of plain names and values",
                 {name: value},
                 "hand an object in",
@@ -417,8 +418,7 @@ def _name_and_params(reducer: Any, params: Params) -> tuple[str, Params]:
     )
     if not is_plain or "<locals>" in cls.__qualname__ or cls.__module__ == "__main__":
         return f"{OBJECT_PREFIX}{cls.__name__}", {}
-    name = f"{cls.__module__}:{cls.__qualname__}"
-    return name, without_none(values)
+    return f"{cls.__module__}:{cls.__qualname__}", without_none(values)
 
 
 def without_none(values: Table) -> dict[str, Any]:

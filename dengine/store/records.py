@@ -535,8 +535,10 @@ def columns(record_type: Any) -> dict[str, tuple[type, bool]]:
     `dict[str, int]` is `dict`, and that of a union is its first. A union must be written with `|`,
     and have None as the last. The result is cached; do not change it.
     """
-    hints = get_type_hints(record_type)
-    return {name: (_plain_type(hint), isinstance(hint, UnionType)) for name, hint in hints.items()}
+    return {
+        name: (_plain_type(hint), isinstance(hint, UnionType))
+        for name, hint in get_type_hints(record_type).items()
+    }
 
 
 def _plain_type(hint: Any) -> type:
@@ -592,10 +594,9 @@ def from_row(record_type: Callable[..., T], row: Mapping[str, Any], **given: Any
         }
         return record_type(**values, **given)
     except (ValueError, TypeError) as error:
-        name = getattr(record_type, "__name__", record_type)
         raise StoreError(
-            f"Expected a row of {name} as it was written, got another: {error}; see `dengine "
-            "verify`, and restore the store from a copy."
+            f"Expected a row of {record_type.__name__} as it was written, got another: {error}; "
+            "see `dengine verify`, and restore the store from a copy."
         ) from error
 
 

@@ -266,11 +266,10 @@ class VersionTable(CellTable):
         StoreError
             For a stored value that cannot be read, and if the database fails.
         """
-        n_bytes = sa.func.coalesce(sa.func.length(VERSION.c.state), 0).label("n_bytes")
         query = sa.select(
             *(column for column in VERSION.c if column.name != "state"),
             VERSION.c.retrain.label("number"),
-            n_bytes,
+            sa.func.coalesce(sa.func.length(VERSION.c.state), 0).label("n_bytes"),
             KEPT,
         )
         scope = Scope(self._database.cell_id) if cell_only else self._scope
