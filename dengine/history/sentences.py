@@ -168,8 +168,14 @@ def _explain_reason(decision: Decision, trace: TraceArray, circumstances: Circum
     these limits does not fit the trace.
     """
     if decision.reason is Reason.OUTSIDE:
-        left = " and ".join(_limits_left(trace, circumstances)) or "which is not known"
-        return f": it leaves the operator's force limits, {left}, whatever the model says."
+        x = torch.from_numpy(trace)
+        left = [
+            str(limits)
+            for limits in circumstances.recipe.policy.force_limits
+            if ForceLimitsGate([limits], circumstances.spec)(x) != WITHIN_LIMITS
+        ]
+        names = " and ".join(left) or "which is not known"
+        return f": it leaves the operator's force limits, {names}, whatever the model says."
     n_bad = (~np.isfinite(trace)).sum()
     novelty = "" if circumstances.novelty is None else f": {circumstances.novelty}"
     alarm = circumstances.safe_mode or "its reason is not kept"
@@ -196,19 +202,6 @@ def _explain_reason(decision: Decision, trace: TraceArray, circumstances: Circum
         ),
         Reason.LATE: ": the caller timed out and verified the part, so the model was not asked.",
     }[decision.reason]
-
-
-def _limits_left(trace: TraceArray, circumstances: Circumstances) -> Iterator[str]:
-    """Yield, as text, each force limit in `circumstances` that a trace does not keep.
-
-    A force limit is an operator's limit of the signal, and its text has the form
-    START:END:LOW:HIGH. The limits are checked again, one by one; if the trace keeps all of them,
-    nothing is yielded. Raises SettingError for a force limit that does not fit the trace.
-    """
-    x = torch.from_numpy(trace)
-    for limits in circumstances.recipe.policy.force_limits:
-        if ForceLimitsGate([limits], circumstances.spec)(x) != WITHIN_LIMITS:
-            yield str(limits)
 
 
 def _bound_sentences(

@@ -502,8 +502,10 @@ def _count_span(tally: Tally, retrains: list[StoredVersion], policy: Policy) -> 
             outcomes.audited_rejects, outcomes.audited_rejects_good, reject_tolerance, basis=basis
         ),
         bad_accepts=bad_accepts(outcomes, policy),
-        unlabelled=tally.count(
-            lambda group: group.action is Action.VERIFY and group.success is None
+        unlabelled=sum(
+            group.n
+            for group in tally.groups
+            if group.action is Action.VERIFY and group.success is None
         ),
         retrains=len(reports),
         dropped=dict(Counter(report.reason for report in reports if not report.accepted)),

@@ -5,7 +5,7 @@ explanations are computed from them.
 """
 
 from collections import Counter
-from collections.abc import Callable, Collection
+from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Any
 
@@ -154,12 +154,9 @@ class Tally:
     first: float | None
     last: float | None
 
-    def count(self, is_counted: Callable[[DecisionGroup], bool] = lambda group: True) -> int:
-        """Return the number of decisions in the groups for which `is_counted` is true.
-
-        By default in all groups.
-        """
-        return sum(group.n for group in self.groups if is_counted(group))
+    def count(self) -> int:
+        """Return the number of decisions in all groups."""
+        return sum(group.n for group in self.groups)
 
     def by(self, field: str) -> Counter[Any]:
         """Return the number of decisions for each value of a field of `DecisionGroup`.
