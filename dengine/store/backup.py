@@ -121,8 +121,12 @@ def backup_store(url: FilePath, out: FilePath) -> BackupReport:
         finally:
             for suffix in ("-wal", "-shm"):
                 partial.with_name(partial.name + suffix).unlink(missing_ok=True)
-    without = tuple(cell for cell in cells if cell not in waiting)
-    return BackupReport(decisions, labels, sum(map(len, waiting.values())), without)
+    return BackupReport(
+        decisions,
+        labels,
+        from_journals=sum(map(len, waiting.values())),
+        without_journal=tuple(cell for cell in cells if cell not in waiting),
+    )
 
 
 def restore_store(copy: FilePath, store: FilePath) -> tuple[CellHistory, ...]:

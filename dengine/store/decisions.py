@@ -304,14 +304,13 @@ class DecisionTable(CellTable):
             For a stored value that cannot be read, and if the database fails.
         """
         newest = self._n_decisions()
-        aged = (sa.false() if within is None else newest - DECISION.c.number >= within).label(
-            "aged"
-        )
         columns = DECISION.c["action", "predicted", "reason", "audit", "quarantined"]
         query = (
             sa.select(
                 *columns,
-                aged,
+                (sa.false() if within is None else newest - DECISION.c.number >= within).label(
+                    "aged"
+                ),
                 SUCCESS,
                 SOURCE,
                 sa.func.count().label("n"),

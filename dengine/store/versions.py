@@ -24,7 +24,7 @@ from .records import (
     to_row,
     without_rule,
 )
-from .schema import PRODUCT, VERSION, Query, lock
+from .schema import PRODUCT, VERSION, lock
 
 KEPT = VERSION.c.state.is_not(None).label("kept")  # whether a version's arrays are there
 
@@ -47,6 +47,15 @@ class VersionTable(CellTable):
         self._keep = keep
         # The rows of the cell, or of all cells of its product.
         self._shared = self._scope.shared(VERSION.c.cell_id)
+        # The query for the versions that were put in force in the cell or its product, newest
+        # first: `retrain`, the number among all retrains (those whose version was not put in force
+        # are numbered, too), `version`, the number of the version, and `kept`, whether its state
+        # (the stored arrays) is kept.
+        self._accepted = (
+            sa.select(*VERSION.c["retrain", "version"], KEPT)
+            .where(self._shared, VERSION.c.accepted == sa.true())
+            .order_by(VERSION.c.retrain.desc())
+        )
 
     def put(
         self,
@@ -130,9 +139,7 @@ class VersionTable(CellTable):
             number = max(number, self._scope.newest_version(connection) + 1)
             dropped = [
                 stored.retrain
-                for stored in connection.execute(
-                    self._accepted_query().where(VERSION.c.state.is_not(None))
-                )
+                for stored in connection.execute(self._accepted.where(VERSION.c.state.is_not(None)))
                 if not keeps_state(stored.version, number, self._keep)
             ]
             if dropped:
@@ -173,7 +180,7 @@ class VersionTable(CellTable):
         StoreError
             If the database fails.
         """
-        for i, row in enumerate(self._read(self._accepted_query())):
+        for i, row in enumerate(self._read(self._accepted)):
             if not row.kept and i > 0:
                 continue  # its state was deleted, which the newest's never is
             try:
@@ -206,9 +213,7 @@ class VersionTable(CellTable):
             If the database fails.
         """
         retrains = {
-            row.version: row.retrain
-            for row in reversed(self._read(self._accepted_query()))
-            if row.kept
+            row.version: row.retrain for row in reversed(self._read(self._accepted)) if row.kept
         }
         if version not in retrains:
             others = ", ".join(map(str, retrains)) or "none"
@@ -285,17 +290,3 @@ class VersionTable(CellTable):
         Raise StoreError as `all` does.
         """
         return [version.report for version in self.all()]
-
-    def _accepted_query(self) -> Query:
-        """Return the query for the versions that were put in force in the cell or its product.
-
-        The query is not run. A product is robot cells that share labels and versions. The rows are
-        newest first. The columns are `retrain`, the number among all retrains (those whose version
-        was not put in force are numbered, too), `version`, the number of the version, and `kept`,
-        whether its state (the stored arrays) is kept.
-        """
-        return (
-            sa.select(*VERSION.c["retrain", "version"], KEPT)
-            .where(self._shared, VERSION.c.accepted == sa.true())
-            .order_by(VERSION.c.retrain.desc())
-        )
