@@ -135,14 +135,11 @@ def split_line(line: str, delimiter: str) -> list[str]:
 def header_names(cells: Strings) -> list[str]:
     """Return the names of columns in a header; empty cells become `column1`, `column2`, ...
 
-    Blanks around a name are left out. Names that repeat get numbers, like `X.1` and `X.2`.
+    Blanks around a name are left out. A name that repeats gets a number, like `X.2`.
     """
     names = [cell.strip() or f"column{i}" for i, cell in enumerate(cells, 1)]
     places = [names[: i + 1].count(name) for i, name in enumerate(names)]
-    return [
-        f"{name}.{n}" if names.count(name) > 1 else name
-        for name, n in zip(names, places, strict=True)
-    ]
+    return [f"{name}.{n}" if n > 1 else name for name, n in zip(names, places, strict=True)]
 
 
 def _names(top: Strings, header: int, form: TextForm) -> list[str]:
@@ -150,8 +147,8 @@ def _names(top: Strings, header: int, form: TextForm) -> list[str]:
 
     A last name `x*` of `form.names` becomes `x0`, `x1`, ..., as many as the first line of samples
     has cells left, even if this line is left out of the table (`form.drop`). In the header `#` or
-    `%` at the beginning is skipped, an empty cell is called by its number, like `column1`, and
-    names that repeat get numbers, like `X.1` and `X.2`. Raises UnreadableError if there are neither
+    `%` at the beginning is skipped, an empty cell is called by its number, like `column1`, and a
+    name that repeats gets a number, like `X.2`. Raises UnreadableError if there are neither
     names nor a header.
 
     top : the lines from the first to the first row of samples. header : the number of the header's
