@@ -207,5 +207,10 @@ def test_a_long_table_is_cut_like_a_bag(bag, tmp_path):
     rows = zip(bag.stamps, bag.force[:, 2], bag.phase, strict=True)
     text = "".join(f"{np.datetime64(int(t), 'ns')}Z,{z:.9g},{p}\n" for t, z, p in rows)
     (tmp_path / "shift.csv").write_text(f"time,FZ,phase\n{text}")
-    listing(bag, tmp_path / "cycles.csv", first=1)  # a trigger's parts have the numbers from 1 on
-    assert_read(load_dataset(tmp_path, parse_stated(TABLE.splitlines())), bag)
+    path = tmp_path / "cycles.csv"
+    listing(bag, path, first=1)  # a trigger's parts have the numbers from 1 on
+    description = parse_stated(TABLE.splitlines())
+    assert_read(load_dataset(tmp_path, description), bag)
+    path.write_text(path.read_text() + "\n9,,,OK")
+    with pytest.raises(DataError, match="a row of cycles.csv for each start of the trigger"):
+        load_dataset(tmp_path, description)

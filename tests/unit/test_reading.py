@@ -288,6 +288,13 @@ def test_a_damaged_file_is_a_fault_and_the_others_are_read(tmp_path, old, new, l
     assert_only_fault(written, [line], column)
 
 
+def test_a_file_without_a_part_is_a_fault(tmp_path):
+    written = write(tmp_path, "long parquet", X, y, PLAIN)
+    pd.read_parquet(written.file)[:0].to_parquet(tmp_path / "empty.parquet")
+    data = load_dataset(tmp_path, written.description)
+    assert [fault.source for fault in data.faults] == ["empty.parquet"]
+
+
 @pytest.mark.parametrize("kind", ["json", "npz", "text"])
 @pytest.mark.parametrize("keep", [0, 0.5, 0.99])
 def test_a_cut_file_is_a_fault(tmp_path, kind, keep):
@@ -397,6 +404,9 @@ label={listing="list.csv", key="part", column="verdict", good="OK", bad="NOK"}  
 time.format=parsec             time.format
 time.rate_hz=2e6               1 Hz to 1 MHz
 channels={FZ={limit=1.0}, "Weg ü"=""}  one limit
+part={column="part", path="(1)"}  one place of the part's number
+label={column="verdict", path="(1)", good="OK", bad="NOK"}  one place of the label
+label={column="verdict", good=["OK", "NOK"], bad="NOK"}  one meaning of each word
 """
 
 

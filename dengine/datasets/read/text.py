@@ -239,7 +239,9 @@ def _read_strictly(content: bytes, table: Table, form: TextForm) -> Table:
     }
     damage = [
         UnreadableError(
-            f"Expected {n} cells, as columns, got {len(row)}: mend the line, or see text.drop", i
+            f"Expected {n} cells, as there are columns, got {len(row)}: mend the line, or see "
+            "text.drop",
+            i,
         )
         for i, row in rows.items()
         if len(row) != n
