@@ -434,10 +434,9 @@ CAPTION = (
     "below it a 95 % interval, with the luck of the recordings and of the order. late: over the "
     "last third of a shuffle, when something has been learned. verified: share of the parts that "
     "were checked. bad of accepted, good of rejected: over these shuffles, with their intervals "
-    "below. The choice, >, is the cheapest, or a safer one that is not dearer beyond chance: the "
-    "guarantee cost, or one that lets fewer bad parts through. All shuffles play the same parts: "
-    "only parts that are recorded later are a clean test. Shuffles also hide drift, which "
-    "dengine replay --in-order shows."
+    "below. The choice, >, is the cheapest, or one that lets fewer bad parts through and is not "
+    "dearer beyond chance. All shuffles play the same parts: only parts that are recorded later "
+    "are a clean test. Shuffles also hide drift, which dengine replay --in-order shows."
 )
 COLUMNS = ("rule", "LB", "cost", "late", "verified", "bad of\naccepted", "good of\nrejected")
 CURVE_FIELDS = (

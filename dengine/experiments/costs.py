@@ -155,8 +155,8 @@ class CostCurve:
     rows : tuple of PolicyCost
         The policies that played the shuffles that are reported, the cheapest first.
     marked : PolicyCost
-        The best of `rows`: the cheapest, or a safer one that is not significantly dearer, which is
-        the guarantee "cost", or else a row that let fewer bad parts through.
+        The best of `rows`: the cheapest, or one that let fewer bad parts through and is not
+        significantly dearer; but the guarantee "cost" is never left for such a row.
     verdict : str
         "pays" if the whole interval of the marked policy is below the cost of verifying
         everything, "does not pay" if its expected cost is not (of the guarantee "cost": its mean),
@@ -290,14 +290,11 @@ class CostCurve:
                 f"costs {cost}, or {amount(row.expected_cost)} with half an error more."
             )
         elif cheapest != row:
-            why = "the cost guarantee limits what errors may cost"
-            if not row.limits_loss:
-                few, many = (f"{1000 * each.escaped:.2g}" for each in (row, cheapest))
-                why = f"of 1,000 parts it lets {many} bad ones through, not {few}"
             other = capitalized(policy_name(cheapest.policy))
             text += (
-                f" {other} costs {amount(cheapest.cost)}, which is not cheaper beyond chance, and "
-                f"{why}."
+                f" {other} costs {amount(cheapest.cost)}, which is not cheaper beyond chance. Of "
+                f"1,000 parts it lets {1000 * cheapest.escaped:.2g} bad ones through, not "
+                f"{1000 * row.escaped:.2g}."
             )
         if missing is not None:
             how = "where every bad accepted part stops the line"
@@ -807,10 +804,10 @@ def _choose(groups: Groups, costs: Costs) -> tuple[list[PolicyCost], PolicyCost,
     must have). A row is good if it is not dearer than the first at a one-sided level of 5 %, and
     its expected cost (with half an error added to each share of errors) is below the price of a
     check. Of the guarantee "cost", whose errors may cost little more than checks (`limits_loss`),
-    the mean cost counts in place of the expected one. The best row is that of the guarantee "cost"
-    if it is good, else the good row with the fewest bad accepted parts. The verdict is "does not
-    pay" if no row is good; the best row is the first one then. Otherwise it is "pays" if the whole
-    interval of the best row's cost is below the price of a check, else "may pay".
+    the mean cost counts in place of the expected one. The best row is the cheapest good one if it
+    has the guarantee "cost", else the good row with the fewest bad accepted parts. The verdict is
+    "does not pay" if no row is good; the best row is the first one then. Otherwise it is "pays" if
+    the whole interval of the best row's cost is below the price of a check, else "may pay".
     """
     rows = [_policy_cost(policy, replays, costs) for policy, replays in groups.items()]
     rows.sort(key=lambda row: (row.cost, row.escaped, -row.policy.lower_bound))
@@ -823,7 +820,7 @@ def _choose(groups: Groups, costs: Costs) -> tuple[list[PolicyCost], PolicyCost,
             good.append(row)
     if not good:
         return rows, cheapest, "does not pay"
-    marked = min(good, key=lambda row: (not row.limits_loss, row.escaped))
+    marked = good[0] if good[0].limits_loss else min(good, key=lambda row: row.escaped)
     return rows, marked, "pays" if marked.upper < costs.check else "may pay"
 
 
