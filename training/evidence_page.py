@@ -583,8 +583,8 @@ def guarantee_lines(played: pd.DataFrame) -> list[str]:
         'known (`stops="all"`). `python training/evidence_guarantees.py` played these replays at '
         f"commit {commits}. {origin} An entry is: **net seconds** / certain decisions / share of "
         "the accepted parts that were bad. LB 95.8 % is 1 - 5 / 120: if 5 of 120 accepted parts "
-        "are bad, accepting costs as much as checking. The two columns on the right need hindsight: "
-        "the accept threshold and the reject threshold that save most were chosen afterwards, with "
+        "are bad, accepting costs as much as checking. The two columns on the right need "
+        "hindsight: the accept threshold and the reject threshold that save most were chosen afterwards, with "
         "all labels known. The first of the two columns applies the thresholds to the score that "
         "each part had when the guarantee `cost` decided on it. The second column "
         "applies them to the scores of a model that was trained beforehand on the whole set, with "
