@@ -50,14 +50,7 @@ class HeldError(CellError):
 class PackageType(IntEnum):
     """Type of a package, the letter in its header."""
 
-    VERSION = ord("V")
-    CONTROLLER = ord("v")
-    TEXT = ord("M")
-    DATA = ord("U")
-    OUTPUTS = ord("O")
-    INPUTS = ord("I")
-    START = ord("S")
-    PAUSE = ord("P")
+    VERSION, CONTROLLER, TEXT, DATA, OUTPUTS, INPUTS, START, PAUSE = b"VvMUOISP"
 
 
 class Package(NamedTuple):
