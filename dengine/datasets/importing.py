@@ -360,11 +360,10 @@ def _verifying_decisions(traces: TraceArray, data: Dataset) -> Iterator[Decision
     or has characters that do not print; the decisions before it are yielded.
     """
     n_equal = Counter[int]()
-    parts = [None] * len(data) if data.part is None else data.part.tolist()
-    for hash_, part in zip(content_hash(traces).tolist(), parts, strict=True):
+    for i, hash_ in enumerate(content_hash(traces).tolist()):
         yield verify_decision(
             f"import-{hash_ & (2**64 - 1):016x}-{n_equal[hash_]}",
-            as_part(part),
+            None if data.part is None else as_part(data.part.item(i)),
             0,
             Reason.NO_MODEL,
         )
