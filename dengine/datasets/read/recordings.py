@@ -328,8 +328,9 @@ def parts_of(file: str | Table, description: Description, base: Path) -> Iterato
         if not is_dropped(part, description.rows):
             yield from cut(part, description, base) if description.is_cut else [part]
     if part is None:
-        columns = listed(file.columns)
-        raise UnreadableError(f"Expected parts, found none in the columns {columns}", file.header)
+        raise UnreadableError(
+            f"Expected parts, found none in the columns {listed(file.columns)}", file.header
+        )
 
 
 def is_dropped(part: Table, rows: RowMeanings) -> bool:

@@ -180,10 +180,10 @@ def _split_wide(table: Table, description: Description) -> Iterator[Table]:
     for i, line in enumerate(table.lines):
         row = {name: c[i] if len(c) == n else c for name, c in table.columns.items()}
         damage = [error for error in table.damage if error.line == line]
-        columns: frames.Columns = {}
         try:
             columns = frames.columns_of("", row)
         except UnreadableError as error:
+            columns = {}
             damage = [error]
         for key in table.origin.keys() & columns.keys():
             columns[key] = without_empty_end(columns[key])

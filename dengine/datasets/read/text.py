@@ -138,8 +138,10 @@ def header_names(cells: Strings) -> list[str]:
     Blanks around a name are left out. A name that repeats gets a number, like `X.2`.
     """
     names = [cell.strip() or f"column{i}" for i, cell in enumerate(cells, 1)]
-    places = [names[: i + 1].count(name) for i, name in enumerate(names)]
-    return [f"{name}.{n}" if n > 1 else name for name, n in zip(names, places, strict=True)]
+    return [
+        f"{name}.{n}" if (n := names[:i].count(name)) > 1 else name
+        for i, name in enumerate(names, 1)
+    ]
 
 
 def _names(top: Strings, header: int, form: TextForm) -> list[str]:

@@ -108,11 +108,11 @@ def _listed(times: Floats, description: Description, base: Path) -> Windows:
     with in_listing(about.listing):
         listing = listing_table(base / about.listing, description.text)
         keys = listing.words(about.key)
-        clocks = (
-            Clock((column,), (about.format,), description.time.zone)
+        clock = Clock(format=(about.format,), zone=description.time.zone)
+        begins, ends = (
+            times_of(listing, replace(clock, column=(column,)), description.text) - TOLERANCE
             for column in (about.start, about.end)
         )
-        begins, ends = (times_of(listing, clock, description.text) - TOLERANCE for clock in clocks)
     zero = times[0] if ends.max() < EPOCH <= times[0] else 0.0
     margin = 1.5 / (description.time.rate_hz or np.inf) + TOLERANCE
     least = times[0] - margin
