@@ -109,18 +109,19 @@ def without_repeats(recordings: Sequence[Recording]) -> tuple[list[Recording], F
     of a dead sensor (all samples are equal), although the engine never trains on them.
     """
     hashes = content_hash(np.array([recording.trace for recording in recordings]))
-    sources = [recording.source for recording in recordings]
     groups = defaultdict[int, list[int]](list)
     for i, hash_ in enumerate(hashes.tolist()):
         groups[hash_].append(i)
     faults = dict[int, Fault]()
     for group in groups.values():
-        first = min(group, key=lambda i: len(sources[i]))  # `x.csv`, not `Copy of x.csv`
-        message = f"Expected one label for the samples of {sources[first]}, got two"
+        # `x.csv`, not `Copy of x.csv`
+        first = min(group, key=lambda i: len(recordings[i].source))
+        source = recordings[first].source
+        message = f"Expected one label for the samples of {source}, got two"
         if len({recordings[i].label for i in group}) == 1:
-            message = f"Expected other samples than those of {sources[first]}, it repeats them"
+            message = f"Expected other samples than those of {source}, it repeats them"
             group.remove(first)
-        faults |= {i: Fault(sources[i], 0, message) for i in group}
+        faults |= {i: Fault(recordings[i].source, 0, message) for i in group}
     return [item for i, item in enumerate(recordings) if i not in faults], [*faults.values()]
 
 
