@@ -401,7 +401,6 @@ def fitted(samples: Floats, seconds: Floats | None, description: Description) ->
     rate = description.time.rate_hz
     n = samples.shape[1]
     kind = FITS.index(about.lengths.removesuffix("-all"))
-    can_fit = can_fit_length(n, about.samples, kind) or (about.lengths == "pad-all" and n > 0)
     wrong = f"Expected {about.samples} samples, got {n}"
     if about.lengths == "resample" and seconds is not None:
         seconds = seconds - seconds[0]
@@ -409,6 +408,6 @@ def fitted(samples: Floats, seconds: Floats | None, description: Description) ->
         wrong += f", which last {seconds[-1]:.4g} s and not {times[-1]:.4g} s"
         if times[-1] <= seconds[-1] + (1 + ROUNDING) / rate:
             return np.array([np.interp(times, seconds, row) for row in samples], np.float32)
-    elif can_fit:
+    elif can_fit_length(n, about.samples, kind) or (about.lengths == "pad-all" and n > 0):
         return fit_length(torch.from_numpy(samples.astype(np.float32)), about.samples, kind).numpy()
     raise UnreadableError(f"{wrong}; see traces.lengths, which is {about.lengths}")
