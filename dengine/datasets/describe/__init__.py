@@ -141,8 +141,8 @@ def choose_files(p: Proposal, root: Path) -> bool:
     p.base = root if root.is_dir() else root.parent
     p.names = names
     p.others = sorted({*names_in(root, ())}.difference(names), key=natural_key)
-    p.put("files", globs(p.names))
-    p.put("format", SUFFIXES.get(suffix_of(p.names[0]), "text"))
+    p.put("files", globs(names))
+    p.put("format", SUFFIXES.get(suffix_of(names[0]), "text"))
     return True
 
 

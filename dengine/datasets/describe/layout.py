@@ -102,8 +102,7 @@ def _propose_part_column(p: Proposal, columns: Iterable[Column], runs: Sequence[
     note = f"one of {listed(named)}, or several, like {as_option('part.column', named[:2])}"
     if len(p.names) > 1:
         note += "; or layout=files: each file is a part"
-    note += f". {RESULTS}"
-    p.put("part.column", *(likely if len(likely) == 1 else (UNKNOWN, note)))
+    p.put("part.column", *(likely if len(likely) == 1 else (UNKNOWN, f"{note}. {RESULTS}")))
 
 
 def is_even_clock(column: Column) -> bool:
