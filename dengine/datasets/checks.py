@@ -13,7 +13,7 @@ import numpy as np
 from ..errors import DataError, instead, listed, percent
 from ..folds import content_hash
 from .dataset import LEAST_RATE_HZ, MOST_RATE_HZ, Dataset, Fault, Faults, expect_all
-from .description import Clock, Description, LabelSource, TextForm
+from .description import SOURCES, Clock, Description, TextForm
 from .table import Recording
 
 
@@ -25,7 +25,7 @@ def check_description(description: Description) -> None:
     must be a channel, and all channels must have the same `limit`, the range of the sensor. If the
     `order` of the parts is "time", there must be a column of times. If recordings with a column of
     times are resampled, there must be a rate. A part's number may have one place, and so may
-    labels, whose words must have one meaning each (`is_clear`). The settings in `[time]` and
+    labels, whose words must have one meaning each. The settings in `[time]` and
     `[text]` must be valid, for example name an encoding that Python knows (`check_forms`). Nothing
     else is checked: neither a trigger (the condition at which a part begins), nor whether columns
     exist.
@@ -33,7 +33,6 @@ def check_description(description: Description) -> None:
     if open_keys := description.open_keys:
         raise DataError(f"Expected a description without ?, still open: {listed(open_keys)}.")
     limits = {channel.limit for channel in description.channels.values()}
-    places = (description.part.column, description.part.path, description.part.line)
     expect_all(
         {
             "traces.samples, the samples of each trace": description.traces.samples > 0,
@@ -46,23 +45,22 @@ def check_description(description: Description) -> None:
                 or not description.time.column
             ),
             "one limit for all channels": len(limits) == 1,
-            "one place of the part's number in [part]": sum(map(bool, places)) < 2,
-            "one place of the label, and one meaning of each word, in [label] and [[check]]": all(
-                map(is_clear, description.labels)
+            "one place each of the label and of the part's number": all(
+                map(has_one_place, (*description.labels, description.part))
+            ),
+            "one meaning of each word in [label] and [[check]]": all(
+                len(source.meanings) == len(source.good + source.bad + source.unchecked)
+                for source in description.labels
             ),
         }
     )
     check_forms(description.time, description.text)
 
 
-def is_clear(source: LabelSource) -> bool:
-    """Return whether labels have one place, or none, and each word one meaning, or none.
-
-    The places are a path, a line, a topic, and a column, which may be that of a listing.
-    """
-    words = source.good + source.bad + source.unchecked
-    places = (source.path, source.line, source.topic, source.column or source.listing)
-    return sum(map(bool, places)) < 2 and len({*words}) == len(words)
+def has_one_place(source: object) -> bool:
+    """Return whether labels or part numbers have one place, or none; a listing has a column."""
+    places = {key for key in SOURCES if getattr(source, key, "")}
+    return len(places) < 2 or places == {"column", "listing"}
 
 
 def check_forms(clock: Clock, text: TextForm) -> None:

@@ -192,9 +192,9 @@ class Policy:
         """
         given = self.prices if isinstance(self.prices, tuple | list) else ()
         prices = [float(price) for price in given if is_number(price)]
-        is_valid = len(prices) == len(given) == 3
-        is_valid = is_valid and 0.0 < 2.0 * prices[0] < min(prices[1:])
-        is_valid = is_valid and max(prices) <= MOST_CHECKS * prices[0]
+        is_valid = len(prices) == len(given) == 3 and (
+            0.0 < 2.0 * prices[0] < min(prices[1:]) <= max(prices) <= MOST_CHECKS * prices[0]
+        )
         expect(
             is_valid,
             "prices of a check, an escape and a false reject, errors of 2 to 1,000,000 checks",

@@ -129,9 +129,8 @@ class Missing:
 
     Attributes
     ----------
-    accepted, seen : int
-        Number of different accepted parts that would show it, and the number of independent parts
-        for which the accepted parts of the recordings count.
+    accepted : int
+        Number of different accepted parts that would show it.
     recordings, production : int
         Further recordings, or parts of production, that bring them.
     audit_rate : float
@@ -139,7 +138,6 @@ class Missing:
     """
 
     accepted: int
-    seen: int
     recordings: int
     production: int
     audit_rate: float
@@ -247,15 +245,10 @@ class CostCurve:
         audit_rate = 1.0 if row.policy.stops == "all" else row.policy.audited_share or AUDIT_RATE
         if n == most:
             return None
-        # Parts that one recording stands for: several shuffles accept more parts than one does.
-        weight = max(
-            size / share / self.cycles
-            for size, share in zip(sizes, (row.accepted, row.rejected), strict=True)
-            if share
-        )
+        # Several shuffles accept more different parts than one does.
+        weight = sizes[0] / row.accepted / self.cycles if row.accepted else 1.0
         return Missing(
             accepted=math.ceil(sizes[0] * n / self.cycles),
-            seen=round(sizes[0]),
             recordings=n - self.cycles,
             production=math.ceil(n * weight / audit_rate),
             audit_rate=audit_rate,
@@ -290,11 +283,10 @@ class CostCurve:
                 f"costs {cost}, or {amount(row.expected_cost)} with half an error more."
             )
         elif cheapest != row:
-            other = capitalized(policy_name(cheapest.policy))
             text += (
-                f" {other} costs {amount(cheapest.cost)}, which is not cheaper beyond chance. Of "
-                f"1,000 parts it lets {1000 * cheapest.escaped:.2g} bad ones through, not "
-                f"{1000 * row.escaped:.2g}."
+                f" {capitalized(policy_name(cheapest.policy))} costs {amount(cheapest.cost)}, which "
+                f"is not cheaper beyond chance. Of 1,000 parts it lets "
+                f"{1000 * cheapest.escaped:.2g} bad ones through, not {1000 * row.escaped:.2g}."
             )
         if missing is not None:
             how = "where every bad accepted part stops the line"
@@ -305,9 +297,9 @@ class CostCurve:
             text += (
                 f" Not certainly: of the accepted parts up to {percent(row.bad.upper, '.3g')} may "
                 f"be bad, and accepting pays up to {worst}. To show that it pays takes about "
-                f"{missing.accepted:,} different accepted parts with {kind}, and these recordings "
-                f"count as {missing.seen:,}: {missing.recordings:,} more recordings, or "
-                f"{missing.production:,} parts of production {how}."
+                f"{missing.accepted:,} different accepted parts with {kind}: "
+                f"{missing.recordings:,} more recordings, or {missing.production:,} parts of "
+                f"production {how}."
             )
         if not self.fresh:
             text += " The search was not finished: these shuffles also chose the policy."

@@ -212,5 +212,5 @@ def test_a_long_table_is_cut_like_a_bag(bag, tmp_path):
     description = parse_stated(TABLE.splitlines())
     assert_read(load_dataset(tmp_path, description), bag)
     path.write_text(path.read_text() + "\n9,,,OK")
-    with pytest.raises(DataError, match=r"a row of cycles\.csv for each start of the trigger"):
+    with pytest.raises(DataError, match=r"a row of cycles\.csv for each of 8 starts"):
         load_dataset(tmp_path, description)

@@ -404,8 +404,8 @@ label={listing="list.csv", key="part", column="verdict", good="OK", bad="NOK"}  
 time.format=parsec             time.format
 time.rate_hz=2e6               1 Hz to 1 MHz
 channels={FZ={limit=1.0}, "Weg ü"=""}  one limit
-part={column="part", path="(1)"}  one place of the part's number
-label={column="verdict", path="(1)", good="OK", bad="NOK"}  one place of the label
+part={column="part", path="(1)"}  one place each of the label
+label={column="verdict", path="(1)", good="OK", bad="NOK"}  one place each of the label
 label={column="verdict", good=["OK", "NOK"], bad="NOK"}  one meaning of each word
 """
 

@@ -197,9 +197,8 @@ class LabelReader:
             )
         words = sorted(self.listing[key])
         if len(words) > 1:
-            places = ", ".join(f"{word} in line {self.listing[key][word]}" for word in words)
             raise UnreadableError(
-                f"Expected one label for {part or path} in {source.listing}, got {places}"
+                f"Expected one label for {part or path} in {source.listing}, got {listed(words)}"
             )
         return words[0]
 

@@ -252,14 +252,13 @@ def read_recordings(
         if progress is not None:
             progress(1)
     n_starts = len(parts) + len(faults)
-    for label in labels:  # in which a part that the trigger begins is found by its running number
-        by_number = description.windows.trigger and not description.part.column
-        if by_number and label.listing and len(label.listing) != n_starts:
-            raise DataError(
-                f"Expected a row of {label.source.listing} for each start of the trigger, of which "
-                f"there are {n_starts}, got {len(label.listing)}: else later parts have the labels "
-                "of others."
-            )
+    n_listed = len(labels[0].listing)
+    by_number = description.windows.trigger and not description.part.column
+    if by_number and n_listed not in (0, n_starts):  # else later parts have the labels of others
+        raise DataError(
+            f"Expected a row of {description.label.listing} for each of {n_starts} starts of the "
+            f"trigger, got {n_listed}."
+        )
     n_unlabelled = parts.count(None)
     labelled = sorted(filter(None, parts), key=lambda recording: recording.rank)
     recordings, repeats = without_repeats(labelled)
