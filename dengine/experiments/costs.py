@@ -284,8 +284,8 @@ class CostCurve:
             )
         elif cheapest != row:
             text += (
-                f" {capitalized(policy_name(cheapest.policy))} costs {amount(cheapest.cost)}, which "
-                f"is not cheaper beyond chance. Of 1,000 parts it lets "
+                f" {capitalized(policy_name(cheapest.policy))} costs {amount(cheapest.cost)}, "
+                "which is not cheaper beyond chance. Of 1,000 parts it lets "
                 f"{1000 * cheapest.escaped:.2g} bad ones through, not {1000 * row.escaped:.2g}."
             )
         if missing is not None:
