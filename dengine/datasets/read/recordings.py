@@ -230,7 +230,7 @@ def read_recordings(
         If the description does not pass `check_description`, no file is found or a pattern in
         `files` is malformed, a bag or a listing of labels cannot be read, no recording is left, or
         `make_dataset` refuses the traces, like those with more channels than samples. If a trigger
-        begins the parts, also if a listing of labels has more or fewer rows than there are parts.
+        begins the parts, also if the listing of labels has fewer rows than there are parts.
     SettingError
         If `windows.trigger`, the condition at which long recordings are cut, is malformed.
     ValueError
@@ -254,7 +254,7 @@ def read_recordings(
     n_starts = len(parts) + len(faults)
     n_listed = len(labels[0].listing)
     by_number = description.windows.trigger and not description.part.column
-    if by_number and n_listed not in (0, n_starts):  # else later parts have the labels of others
+    if by_number and 0 < n_listed < n_starts:  # else later parts would have the labels of others
         raise DataError(
             f"Expected a row of {description.label.listing} for each of {n_starts} starts of the "
             f"trigger, got {n_listed}."
