@@ -25,10 +25,9 @@ def check_description(description: Description) -> None:
     must be a channel, and all channels must have the same `limit`, the range of the sensor. If the
     `order` of the parts is "time", there must be a column of times. If recordings with a column of
     times are resampled, there must be a rate. A part's number may have one place, and so may
-    labels, whose words must have one meaning each. The settings in `[time]` and
-    `[text]` must be valid, for example name an encoding that Python knows (`check_forms`). Nothing
-    else is checked: neither a trigger (the condition at which a part begins), nor whether columns
-    exist.
+    labels, whose words must have one meaning each. The settings in `[time]` and `[text]` must be
+    valid, for example name an encoding that Python knows (`check_forms`). Nothing else is checked:
+    neither a trigger (the condition at which a part begins), nor whether columns exist.
     """
     if open_keys := description.open_keys:
         raise DataError(f"Expected a description without ?, still open: {listed(open_keys)}.")

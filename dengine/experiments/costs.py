@@ -206,12 +206,11 @@ class CostCurve:
         accepted parts in all (those seen included), how many recordings beside the present ones, or
         how many parts of production without any recordings would show it, if as large a share of
         them is accepted as in one shuffle. In production only parts whose outcome is asked for
-        count: each part if the policy has stops "all" (every bad
-        accepted part stops the line and is reported), otherwise the audited share (parts that are
-        checked at random although the model is certain), which is taken as 5 % (`AUDIT_RATE`) if
-        the policy has no audits. It is assumed that the shares of wrong decisions stay as they were
-        seen. None if the verdict is another, or if 10,000 times the parts of a shuffle (a replay in
-        random order) are too few.
+        count: each part if the policy has stops "all" (every bad accepted part stops the line and
+        is reported), otherwise the audited share (parts that are checked at random although the
+        model is certain), which is taken as 5 % (`AUDIT_RATE`) if the policy has no audits. It is
+        assumed that the shares of wrong decisions stay as they were seen. None if the verdict is
+        another, or if 10,000 times the parts of a shuffle (a replay in random order) are too few.
         """
         row = self.marked
         if self.verdict != "may pay":
@@ -754,11 +753,11 @@ def curve_of(
     recorded parts), all of the same two or more shuffles (random orders of the recordings) in the
     same order. The choice is the cheapest policy, or a safer one that is not significantly dearer;
     but it is "check everything" if no such policy is cheaper than a check of every part (`_choose`
-    has the exact rule). It is made again with each price halved and doubled;
-    choices that differ are in the field `price_changes` of the result. Three arguments become
-    fields of the result: `left_behind`, the policies that were dearer in earlier shuffles;
-    `out_of_reach`, policies that were not played, each with the reason; and `fresh`, whether no
-    policy was chosen by these shuffles.
+    has the exact rule). It is made again with each price halved and doubled; choices that differ
+    are in the field `price_changes` of the result. Three arguments become fields of the result:
+    `left_behind`, the policies that were dearer in earlier shuffles; `out_of_reach`, policies that
+    were not played, each with the reason; and `fresh`, whether no policy was chosen by these
+    shuffles.
     """
     rows, marked, verdict = _choose(groups, costs)
     chosen = _chosen_name(marked, verdict)

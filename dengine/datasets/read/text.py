@@ -150,8 +150,8 @@ def _names(top: Strings, header: int, form: TextForm) -> list[str]:
     A last name `x*` of `form.names` becomes `x0`, `x1`, ..., as many as the first line of samples
     has cells left, even if this line is left out of the table (`form.drop`). In the header `#` or
     `%` at the beginning is skipped, an empty cell is called by its number, like `column1`, and a
-    name that repeats gets a number, like `X.2`. Raises UnreadableError if there are neither
-    names nor a header.
+    name that repeats gets a number, like `X.2`. Raises UnreadableError if there are neither names
+    nor a header.
 
     top : the lines from the first to the first row of samples. header : the number of the header's
     line, 0 for none. form : how the file is written, the section `[text]` of a description.
