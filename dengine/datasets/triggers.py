@@ -2,8 +2,8 @@
 
 A signal is a channel (`FZ_Base`), a field of the controller (`output_int_register_25`,
 `actual_TCP_speed[0]`), or a topic of a bag. The recorder of the UR cell and the reader of bags use
-`as_trigger`, `StartFinder` and `place`. A sample that did not come is NaN at its place: no value is
-made up, and the engine verifies such a trace.
+`as_trigger` and `StartFinder`; the recorder also uses `place`. A sample that did not come is NaN at
+its place: no value is made up, and the engine verifies such a trace.
 """
 
 import re
