@@ -101,9 +101,10 @@ def without_repeats(recordings: Sequence[Recording]) -> tuple[list[Recording], F
 
     The recordings kept stay in their order. All traces must have the same shape (C, T). Two traces
     are equal if they have the same `content_hash`, which rounds samples down to 1/65,536 of their
-    unit, and counts lost samples as 0. Of equal traces with one label that with the shortest source
-    is kept (the first of several); if their labels differ, none is kept. This also holds for traces
-    of a dead sensor (all samples are equal), although the engine never trains on them.
+    unit, and counts lost samples as 0. Of equal traces with one label, the trace with the shortest
+    name of its source is kept, the first if there are several; if their labels differ, none is
+    kept. This also holds for traces of a dead sensor (all samples are equal), although the engine
+    never trains on them.
     """
     hashes = content_hash(np.array([recording.trace for recording in recordings]))
     groups = defaultdict[int, list[int]](list)

@@ -216,14 +216,14 @@ def pattern_of(decimal: str, thousands: str) -> re.Pattern[str]:
     `decimal` is its decimal mark, and `thousands` the mark that may stand between groups of three
     digits; "" allows no groups. The digits before or behind the decimal mark may be missing, but
     not both. The minus sign U+2212 is accepted, too, but not in the exponent. Blanks may stand
-    behind the sign. The pattern is for
-    `fullmatch`, and has no blanks around the number. It is cached.
+    behind the sign. The pattern is for `fullmatch`, and has no blanks around the number. It is
+    cached.
     """
     mark = re.escape(thousands)
     point = re.escape(decimal)
     groups = rf"[1-9]\d{{0,2}}(?:{mark}\d{{3}})+|" if mark else ""
     digits = rf"(?:(?:{groups}\d+)(?:{point}\d*)?|{point}\d+)"
-    return re.compile(rf"[-+{MINUS}]? *{digits}(?:[eE][-+]?\d+)?", re.ASCII)
+    return re.compile(rf"(?:[-+{MINUS}] *)?{digits}(?:[eE][-+]?\d+)?", re.ASCII)
 
 
 def _number(cell: Any, form: TextForm, pattern: re.Pattern[str]) -> float:

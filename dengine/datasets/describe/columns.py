@@ -43,7 +43,7 @@ LOST = ("nan", "null", "none", "n/a", "na", "-", "--", "---", "#n/a", "")
 MOST_CELLS = 20  # of a recording whose form of times is looked at
 # A number with any decimal mark and any mark of groups.
 NUMBER = re.compile(
-    r"\s*[-+−]?\s*(?=[.,]?\d)(\d{1,3}([ '’\u202f\xa0.,]\d{3})+|\d*)([.,]\d*)?([eE][-+]?\d+)?\s*"
+    r"\s*([-+−]\s*)?(?=[.,]?\d)(\d{1,3}([ '’\u202f\xa0.,]\d{3})+|\d*)([.,]\d*)?([eE][-+]?\d+)?\s*"
 )
 # Names of channels, the likeliest first.
 FORCES = (

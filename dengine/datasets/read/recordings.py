@@ -251,12 +251,12 @@ def read_recordings(
                     parts.append(recording_of(part, description, labels))
         if progress is not None:
             progress(1)
-    n_starts = len(parts) + len(faults)
+    n_found = len(parts) + len(faults)
     n_listed = len(labels[0].listing)
     by_number = description.windows.trigger and not description.part.column
-    if by_number and 0 < n_listed < n_starts:  # else later parts would have the labels of others
+    if by_number and 0 < n_listed < n_found:  # else later parts would have the labels of others
         raise DataError(
-            f"Expected a row of {description.label.listing} for each of {n_starts} starts of the "
+            f"Expected a row of {description.label.listing} for each of {n_found} starts of the "
             f"trigger, got {n_listed}."
         )
     n_unlabelled = parts.count(None)
@@ -268,7 +268,6 @@ def read_recordings(
             f"Expected recordings in {name}, none is left: {len(faults)} have faults, "
             f"{n_unlabelled} no label.{first_of(faults)}"
         )
-    n_found = len(recordings) + len(faults) + n_unlabelled
     n_seen = description.seen.recordings
     notes = [unread_note(source, description), *(label.unused_note() for label in labels)]
     if n_found < n_seen:
