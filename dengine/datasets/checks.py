@@ -57,7 +57,11 @@ def check_description(description: Description) -> None:
 
 
 def has_one_place(source: object) -> bool:
-    """Return whether labels or part numbers have one place, or none; a listing has a column."""
+    """Return whether a source states at most one place: a column, path, line, topic or listing.
+
+    A listing, a file with a row for each part, and its column are one place. `source` is the
+    `LabelSource` of labels or the `PartSource` of part numbers.
+    """
     places = {key for key in SOURCES if getattr(source, key, "")}
     return len(places) < 2 or places == {"column", "listing"}
 
