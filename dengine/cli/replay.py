@@ -87,8 +87,9 @@ def _play(
     A replay plays recorded parts through a new engine; each of `tasks` is a replay to be played.
     The finished replays are in the order of their tasks. The error or Ctrl-C that ended the work
     early (None if nothing did) is not raised: the caller must pass it to `_end`. `advance(n)` is
-    called for each n cycles that are played. Of `stream` these are used: the number of processes,
-    and the folder of replays that were finished earlier and are not played again.
+    called for each n cycles that are played, and with the length of each replay that was finished
+    earlier. Of `stream` these are used: the number of processes, and the folder of replays that
+    were finished earlier and are not played again.
     """
     from ..experiments.grid import iterate_replays
 

@@ -24,10 +24,11 @@ def check_description(description: Description) -> None:
     except in `[ignored]` and `[[check]]`. The number of samples of a trace must be 1 or more. There
     must be a channel, and all channels must have the same `limit`, the range of the sensor. If the
     `order` of the parts is "time", there must be a column of times. If recordings with a column of
-    times are resampled, there must be a rate. A part's number may have one place, and so may
-    labels, whose words must have one meaning each. The settings in `[time]` and `[text]` must be
-    valid, for example name an encoding that Python knows (`check_forms`). Nothing else is checked:
-    neither a trigger (the condition at which a part begins), nor whether columns exist.
+    times are resampled, there must be a rate. The part's number and each source of labels may state
+    at most one place (`has_one_place`). Each word of a source of labels may be stated only once.
+    The settings in `[time]` and `[text]` must be valid, for example name an encoding that Python
+    knows (`check_forms`). Nothing else is checked: neither a trigger (the condition at which a part
+    begins), nor whether columns exist.
     """
     if open_keys := description.open_keys:
         raise DataError(f"Expected a description without ?, still open: {listed(open_keys)}.")
@@ -59,8 +60,8 @@ def check_description(description: Description) -> None:
 def has_one_place(source: object) -> bool:
     """Return whether a source states at most one place: a column, path, line, topic or listing.
 
-    A listing, a file with a row for each part, and its column are one place. `source` is the
-    `LabelSource` of labels or the `PartSource` of part numbers.
+    A listing, a file with a row for each part, and its column are one place. With no place stated
+    the result is True. `source` is the `LabelSource` of labels or the `PartSource` of part numbers.
     """
     places = {key for key in SOURCES if getattr(source, key, "")}
     return len(places) < 2 or places == {"column", "listing"}
@@ -105,10 +106,10 @@ def without_repeats(recordings: Sequence[Recording]) -> tuple[list[Recording], F
 
     The recordings kept stay in their order. All traces must have the same shape (C, T). Two traces
     are equal if they have the same `content_hash`, which rounds samples down to 1/65,536 of their
-    unit, and counts lost samples as 0. Of equal traces with one label, the trace with the shortest
-    name of its source is kept, the first if there are several; if their labels differ, none is
-    kept. This also holds for traces of a dead sensor (all samples are equal), although the engine
-    never trains on them.
+    unit, and counts lost samples (NaN) as 0. If equal traces have the same label, the one with the
+    shortest `source` is kept, the first if there are several. If their labels differ, none is kept.
+    This also holds for traces of a dead sensor (all samples are equal), although the engine never
+    trains on them.
     """
     hashes = content_hash(np.array([recording.trace for recording in recordings]))
     groups = defaultdict[int, list[int]](list)

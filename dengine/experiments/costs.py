@@ -116,9 +116,10 @@ class PolicyCost:
 
     @property
     def screening_key(self) -> tuple[bool, bool, float]:
-        """Key by which the halving sorts policies: the cheapest by expected cost first.
+        """Key by which policies are sorted before the dearer half is dropped; smaller is better.
 
-        The guarantee "cost" comes before all others, and policies that verified every part last.
+        Policies with the guarantee "cost" come before all others. Within both groups those that
+        accepted and rejected no part come last; the rest is sorted by expected cost.
         """
         return not self.limits_loss, self.accepted + self.rejected == 0.0, self.expected_cost
 
@@ -202,15 +203,16 @@ class CostCurve:
         """What evidence would turn the verdict "may pay" into "pays", as a `Missing`.
 
         The verdict is "may pay" if the policy is cheaper than checking every part, but the interval
-        of its cost does not show this yet. One need is given in three units: how many different
-        accepted parts in all (those seen included), how many recordings beside the present ones, or
-        how many parts of production without any recordings would show it, if as large a share of
-        them is accepted as in one shuffle. In production only parts whose outcome is asked for
-        count: each part if the policy has stops "all" (every bad accepted part stops the line and
-        is reported), otherwise the audited share (parts that are checked at random although the
-        model is certain), which is taken as 5 % (`AUDIT_RATE`) if the policy has no audits. It is
-        assumed that the shares of wrong decisions stay as they were seen. None if the verdict is
-        another, or if 10,000 times the parts of a shuffle (a replay in random order) are too few.
+        of its cost does not show this yet. Beside `audit_rate` the result has three numbers, each
+        of which alone would show it: different accepted parts in all (those seen included),
+        recordings beside the present ones, and parts of production without any recordings, if as
+        large a share of them is accepted as in one shuffle (a replay in random order). In
+        production only parts whose outcome is asked for count: each part if the policy has stops
+        "all" (every bad accepted part stops the line and is reported), otherwise the audited share
+        (parts that are checked at random although the model is certain), which is taken as 5 %
+        (`AUDIT_RATE`) if the policy has no audits. It is assumed that the shares of wrong decisions
+        stay as they were seen. None if the verdict is another, or if 10,000 times the parts of a
+        shuffle are too few.
         """
         row = self.marked
         if self.verdict != "may pay":
@@ -792,13 +794,14 @@ def _choose(groups: Groups, costs: Costs) -> tuple[list[PolicyCost], PolicyCost,
     `groups` has each policy (settings of the rule that decides) with its replays. The rows are
     sorted by mean cost; among equal costs the row with fewer bad accepted parts comes first, then
     the row whose policy has the higher lower bound (the success probability that accepted parts
-    must have). A row is good if it is not dearer than the first at a one-sided level of 5 %, and
+    must have). A row is good if it is not significantly dearer than the first (one-sided, 5 %), and
     its expected cost (with half an error added to each share of errors) is below the price of a
-    check. Of the guarantee "cost", whose errors may cost little more than checks (`limits_loss`),
-    the mean cost counts in place of the expected one. The best row is the cheapest good one if it
-    has the guarantee "cost", else the good row with the fewest bad accepted parts. The verdict is
-    "does not pay" if no row is good; the best row is the first one then. Otherwise it is "pays" if
-    the whole interval of the best row's cost is below the price of a check, else "may pay".
+    check. For a policy with the guarantee "cost", whose errors may cost little more than checks
+    (`limits_loss`), the mean cost counts in place of the expected one. The best row is the cheapest
+    good one if it has the guarantee "cost", else the good row with the fewest bad accepted parts,
+    the cheapest of several. The verdict is "does not pay" if no row is good; the best row is the
+    first one then. Otherwise it is "pays" if the whole interval of the best row's cost is below the
+    price of a check, else "may pay".
     """
     rows = [_policy_cost(policy, replays, costs) for policy, replays in groups.items()]
     rows.sort(key=lambda row: (row.cost, row.escaped, -row.policy.lower_bound))

@@ -331,10 +331,11 @@ def _other_scales(p: Proposal) -> Iterator[str]:
 
 
 def may_be_channel(column: Column) -> bool:
-    """Return whether a column may be a channel, if it has no other use in the description.
+    """Return whether a column looks like a channel, by its cells.
 
-    It must have at least three different numbers, change within a recording, and be neither times
-    nor a status with a text (`is_status`), nor a counter, which rises by 1 in each row.
+    Whether it has another use in the description is not checked. It must have at least three
+    different numbers, change within one recording or more, and be neither times nor a status with
+    a text (`is_status`), nor a counter, which rises by 1 in each row.
     """
     is_counter = len(column.steps) and (column.steps == 1).all()
     is_other = is_counter or is_clock(column) or is_status(column) or column.fixed

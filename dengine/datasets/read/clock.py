@@ -141,9 +141,10 @@ def check_steps(seconds: Floats, clock: Clock, table: Table) -> None:
 
     `seconds`, shape (rows,), has the times of the rows of `table`, at least one. No step from one
     to the next may be longer than `clock.gap` steps of the stated rate, `clock.rate_hz`, or
-    `clock.gap` mean steps if none is stated. With `clock.gap` 0 steps may have any length, and
-    up to half of them may be 0; otherwise equal times are refused. The number of steps may differ
-    by 3 % from the rate times the whole time; without a rate any will do. A single time passes.
+    `clock.gap` mean steps if none is stated. With `clock.gap` 0 steps may have any length, and up
+    to half of them may be 0. With another `clock.gap` equal times are refused. The number of steps
+    may differ by at most 3 % from the rate times the time from first to last; without a rate any
+    will do. A single time passes.
     """
     steps = np.diff(seconds)
     rate = clock.rate_hz

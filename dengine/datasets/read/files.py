@@ -168,9 +168,10 @@ def find_files(root: Path, description: Description) -> list[str]:
     """Return the files that a description names, as paths relative to the folder.
 
     The description says how recordings are read; its `files` and `exclude` are patterns like
-    `*.csv`. The result is sorted by file name, run_2 before run_10. Hidden files and others that
-    are no recordings (`names_in`), files that list labels or parts, if the description names them,
-    and files that match a pattern in `exclude` are left out. If `root` is a file, its name alone is
+    `*.csv`. If `files` is empty, all files with a suffix of recordings, like .csv, are meant. The
+    result is sorted by file name, run_2 before run_10. Hidden files and others that are no
+    recordings (`names_in`), files that list labels or parts, if the description names them, and
+    files that match a pattern in `exclude` are left out. If `root` is a file, its name alone is
     returned, whatever the description says. Raises DataError if no file is left, or for a malformed
     pattern.
     """

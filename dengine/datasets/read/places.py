@@ -232,10 +232,11 @@ class LabelReader:
 
         `table` is the table of the recording, and `part` its part number. If the source is a
         listing (a file with a row for each recording or part), the key of the recording that was
-        found in it is added to `used`, the keys found so far. The word that stands for the label is
-        compared exactly with the words that `source` states for each meaning; if a word is stated
-        for several, good comes before bad, and bad before not checked. Raises what `word` raises,
-        and UnreadableError if the word, which may be empty, has no stated meaning.
+        found in it is added to `used`, the keys found so far, also if an error follows. The word
+        that stands for the label is compared exactly with the words that `source` states for each
+        meaning; if a word is stated for several, good comes before bad, and bad before not checked.
+        Raises what `word` raises, and UnreadableError if the word, which may be empty, has no
+        stated meaning.
         """
         source = self.source
         word = self.word(table, part)

@@ -112,8 +112,11 @@ def rank_of(table: Table, seconds: Floats | None, description: Description) -> A
     """Return what recordings are sorted by, as `order` of the description says: `Recording.rank`.
 
     `table` has the samples of a part, and `seconds`, shape (n,), their times; None without a clock.
-    Raises UnreadableError if `order` is a column that is missing, has lists or no rows, or whose
-    first word is empty or has a date that cannot be sorted (`is_unsorted`).
+    The result is the `natural_key` of the path, without words for labels, if `order` is "path"; the
+    first time if it is "time"; "" if it is "name", or "time" without a clock; and the `sort_key` of
+    the first word of the column if it is a column. Raises UnreadableError if `order` is a column
+    that is missing, has lists or no rows, or whose first word is empty or has a date that cannot be
+    sorted (`is_unsorted`).
     """
     order = description.order
     if order == "path":
@@ -310,14 +313,14 @@ def parts_of(file: str | Table, description: Description, base: Path) -> Iterato
     """Yield the tables of the parts in a file, or in a table that was read already.
 
     The description says how files are read. Each table into which `split` divides the file is one
-    part, or, if the section `[windows]` is stated, a long recording that is cut into parts. It is
-    left out if a column that the section `[rows]` names has a single cell in it, with a word to
-    drop (`is_dropped`). `base` is the folder of the file, and of the listing in `[windows]`, a file
-    with the parts' starts and ends. Raises UnreadableError or DataError if the file cannot be read,
-    UnreadableError if there is no part in it, DataError if it cannot be split, or one of its
-    recordings cannot be cut (those before it are yielded), SettingError if `windows.trigger`, the
-    condition at which a part begins, is malformed, and LookupError for an encoding that Python does
-    not know.
+    part, or, if the section `[windows]` is stated, a long recording that is cut into parts. A table
+    is left out if a column that the section `[rows]` names has a single cell in it, with a word to
+    drop (`is_dropped`); if all are left out, nothing is yielded or raised. `base` is the folder of
+    the file, and of the listing in `[windows]`, a file with the parts' starts and ends. Raises
+    UnreadableError or DataError if the file cannot be read, UnreadableError if `split` yields no
+    table, DataError if it cannot be split, or one of its recordings cannot be cut (those before it
+    are yielded), SettingError if `windows.trigger`, the condition at which a part begins, is
+    malformed, and LookupError for an encoding that Python does not know.
     """
     if not isinstance(file, Table):
         file = table_of(read_file(base / file), file, description)
